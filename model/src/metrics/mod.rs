@@ -1,0 +1,1 @@
+//! Error figures, one definition for the whole program.

@@ -1,0 +1,1 @@
+//! CDR, the wire format of ROS 2 messages, without ROS.

@@ -1,0 +1,180 @@
+//! The one configuration struct: its fields are the YAML schema, the defaults, the ROS parameters and the documentation.
+//!
+//! Each section is written with `section!`, which keeps a field's doc comment as the text `storm config` and the README
+//! table print. Unknown keys are refused; every value is checked by [`Config::validate`].
+
+mod file;
+mod section;
+mod validate;
+
+pub use file::ConfigError;
+pub use section::ParameterDoc;
+use section::section;
+use serde::{Deserialize, Serialize};
+
+section! {
+    /// Topics and frames.
+    pub struct InputConfig {
+        /// Image topics, one per camera, in the network's order (left to right); empty: found by type.
+        images: Vec<String> = Vec::new(),
+        /// CameraInfo topics in the same order; empty: the one beside each image topic.
+        camera_infos: Vec<String> = Vec::new(),
+        /// Pose topic (PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped or TFMessage); empty: found by type.
+        pose: String = String::new(),
+        /// Fixed frame of the poses; used with TF, and to name the map frame in the outputs.
+        map_frame: String = "map".into(),
+        /// Vehicle frame; empty: the pose message's child frame, else `base_link`.
+        base_frame: String = String::new(),
+        /// Camera mounting, one entry per camera: x y z (m) then qw qx qy qz, optical frame in the vehicle frame; empty: from /tf_static.
+        base_from_camera: Vec<[f64; 7]> = Vec::new(),
+        /// Camera the window is anchored at; -1: the one that looks most nearly along the vehicle's x axis.
+        reference_camera: i64 = -1,
+        /// Constant added to each camera's stamps, seconds; empty: none.
+        image_time_offset_sec: Vec<f64> = Vec::new(),
+        /// Whether images are rectified already: `auto` (the topic name says so), `yes`, `no`.
+        rectified: String = "auto".into(),
+        /// Topics below this prefix are ground truth: never input, used for scoring.
+        truth_prefix: String = "/ground_truth".into(),
+    }
+}
+
+section! {
+    /// How images and poses are brought together.
+    pub struct SyncConfig {
+        /// Largest distance of an image's stamp from the set's reference stamp, seconds.
+        slop_sec: f64 = 0.02,
+        /// How long a set waits for its missing cameras, seconds of message time.
+        timeout_sec: f64 = 0.25,
+        /// How long a set waits for a pose after its newest image, seconds of message time.
+        pose_wait_sec: f64 = 0.5,
+        /// Largest gap between two poses that is still interpolated across, seconds.
+        pose_gap_sec: f64 = 0.5,
+        /// After this long without a set the starvation report is given, seconds.
+        starvation_sec: f64 = 5.0,
+        /// A stamp that goes back by more than this is a clock jump: window and sync start anew, seconds.
+        jump_back_sec: f64 = 1.0,
+        /// A stamp that goes forward by more than this is a clock jump, seconds.
+        jump_forward_sec: f64 = 10.0,
+    }
+}
+
+section! {
+    /// The sliding window.
+    pub struct WindowConfig {
+        /// Timesteps the network sees, 1 to 10.
+        timesteps: usize = 4,
+        /// Time between them, seconds.
+        stride_sec: f64 = 0.5,
+        /// Least time between two steps, seconds; 0: a step at every new synchronized set.
+        hop_sec: f64 = 0.0,
+        /// Largest distance of a set from its place in the window, as a part of the stride.
+        stride_tolerance: f64 = 0.25,
+        /// Time the network's clock is divided by, seconds (the training's clip length).
+        timespan_sec: f64 = 2.0,
+    }
+}
+
+section! {
+    /// The network.
+    pub struct ModelConfigSection {
+        /// Weights file (.safetensors, .pth, .pt); empty: the weights that ship, or seeded random ones until there are any.
+        weights: String = String::new(),
+        /// Architecture when there is no weights file: tiny, small, b8, l8, xl8, h8, b16, l16, h16.
+        preset: String = "tiny".into(),
+        /// Seed of the random weights used without a weights file.
+        untrained_seed: u64 = 1,
+        /// Where it runs: cpu, cuda, metal.
+        device: String = "cpu".into(),
+        /// Picture width the network sees, pixels, a multiple of the patch; 0: what the weights were made for.
+        image_width: usize = 0,
+        /// Picture height the network sees, pixels, a multiple of the patch; 0: what the weights were made for.
+        image_height: usize = 0,
+        /// Threads for the network and the rasteriser; 0: all cores.
+        threads: usize = 0,
+    }
+}
+
+section! {
+    /// The long-horizon map.
+    pub struct MapConfig {
+        /// Edge of the merging voxels, metres.
+        voxel_m: f64 = 0.25,
+        /// Gaussians faster than this do not enter the map, m/s.
+        static_speed_mps: f64 = 1.0,
+        /// Gaussians less opaque than this do not enter the map.
+        min_opacity: f64 = 0.1,
+        /// Gaussians deeper than this in their own picture do not enter the map, metres.
+        max_depth_m: f64 = 80.0,
+        /// Hard cap on map Gaussians; the least confident go first.
+        max_gaussians: usize = 2_000_000,
+    }
+}
+
+section! {
+    /// Point trajectories.
+    pub struct TracksConfig {
+        /// Gaussians slower than this start no trajectory, m/s.
+        min_speed_mps: f64 = 1.0,
+        /// Gaussians less opaque than this start no trajectory.
+        min_opacity: f64 = 0.3,
+        /// A trajectory continues at the nearest Gaussian within this distance of its predicted place, metres.
+        gate_m: f64 = 0.5,
+        /// Trajectories shorter than this many points are not written.
+        min_points: usize = 3,
+        /// Most trajectories kept alive at once.
+        max_active: usize = 5_000,
+    }
+}
+
+section! {
+    /// What is written.
+    pub struct OutputConfig {
+        /// Write outputs.mcap, the topics the node would have published.
+        bag: bool = true,
+        /// Gaussians less opaque than this are not published (1/255 is what a picture can show).
+        min_opacity: f64 = 0.00392156862745098,
+        /// Most Gaussians in one published cloud; the least opaque are left out and counted. 0: no limit.
+        max_gaussians: usize = 0,
+        /// Steps shown in report.html, evenly spread.
+        report_steps: usize = 8,
+        /// Render frames that are not context at their own time and pose and score them.
+        score_held_out: bool = true,
+        /// Most held-out frames scored per step; they are spread over the window.
+        score_frames_per_step: usize = 2,
+    }
+}
+
+/// The whole configuration.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// Topics and frames.
+    pub input: InputConfig,
+    /// How images and poses are brought together.
+    pub sync: SyncConfig,
+    /// The sliding window.
+    pub window: WindowConfig,
+    /// The network.
+    pub model: ModelConfigSection,
+    /// The long-horizon map.
+    pub map: MapConfig,
+    /// Point trajectories.
+    pub tracks: TracksConfig,
+    /// What is written.
+    pub output: OutputConfig,
+}
+
+impl Config {
+    /// Every parameter with its dotted name, default and description, in the order of the file.
+    pub fn describe() -> Vec<ParameterDoc> {
+        let mut docs = Vec::new();
+        docs.extend(InputConfig::describe("input"));
+        docs.extend(SyncConfig::describe("sync"));
+        docs.extend(WindowConfig::describe("window"));
+        docs.extend(ModelConfigSection::describe("model"));
+        docs.extend(MapConfig::describe("map"));
+        docs.extend(TracksConfig::describe("tracks"));
+        docs.extend(OutputConfig::describe("output"));
+        docs
+    }
+}

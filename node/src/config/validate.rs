@@ -1,0 +1,102 @@
+//! Which values are accepted.
+
+use super::{Config, ConfigError};
+
+impl Config {
+    /// Checks every value; the error names the key, the value and what is accepted.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let (sync, window) = (&self.sync, &self.window);
+        between("sync.slop_sec", sync.slop_sec, 0.0, 10.0)?;
+        between("sync.timeout_sec", sync.timeout_sec, 0.0, 60.0)?;
+        between("sync.pose_wait_sec", sync.pose_wait_sec, 0.0, 60.0)?;
+        between("sync.pose_gap_sec", sync.pose_gap_sec, 1e-6, 60.0)?;
+        between("sync.starvation_sec", sync.starvation_sec, 0.1, 3600.0)?;
+        between("sync.jump_back_sec", sync.jump_back_sec, 1e-3, 3600.0)?;
+        between("sync.jump_forward_sec", sync.jump_forward_sec, 0.1, 86400.0)?;
+        count("window.timesteps", window.timesteps, 1, 10)?;
+        between("window.stride_sec", window.stride_sec, 1e-3, 60.0)?;
+        between("window.hop_sec", window.hop_sec, 0.0, 60.0)?;
+        between("window.stride_tolerance", window.stride_tolerance, 0.0, 0.5)?;
+        between("window.timespan_sec", window.timespan_sec, 1e-3, 600.0)?;
+        between("map.voxel_m", self.map.voxel_m, 0.01, 100.0)?;
+        between("map.static_speed_mps", self.map.static_speed_mps, 0.0, 1000.0)?;
+        between("map.min_opacity", self.map.min_opacity, 0.0, 1.0)?;
+        between("map.max_depth_m", self.map.max_depth_m, 0.1, 1e4)?;
+        count("map.max_gaussians", self.map.max_gaussians, 1, 100_000_000)?;
+        between("tracks.min_speed_mps", self.tracks.min_speed_mps, 0.0, 1000.0)?;
+        between("tracks.min_opacity", self.tracks.min_opacity, 0.0, 1.0)?;
+        between("tracks.gate_m", self.tracks.gate_m, 1e-3, 100.0)?;
+        count("tracks.min_points", self.tracks.min_points, 1, 1_000_000)?;
+        count("tracks.max_active", self.tracks.max_active, 1, 10_000_000)?;
+        between("output.min_opacity", self.output.min_opacity, 0.0, 1.0)?;
+        count("output.report_steps", self.output.report_steps, 0, 1000)?;
+        one_of("input.rectified", &self.input.rectified, &["auto", "yes", "no"])?;
+        one_of("model.device", &self.model.device, &["cpu", "cuda", "metal"])?;
+        for x in &self.input.image_time_offset_sec {
+            between("input.image_time_offset_sec", *x, -60.0, 60.0)?;
+        }
+        for (i, mount) in self.input.base_from_camera.iter().enumerate() {
+            let q: f64 = mount[3..].iter().map(|x| x * x).sum();
+            if !(mount.iter().all(|x| x.is_finite()) && (0.99..1.01).contains(&q)) {
+                let expected = format!("entry {i} wants seven finite numbers, the last four a unit quaternion w x y z");
+                return Err(ConfigError::Value {
+                    key: "input.base_from_camera",
+                    value: format!("{mount:?}"),
+                    expected,
+                });
+            }
+        }
+        let cameras = self.input.images.len();
+        same_length("input.camera_infos", self.input.camera_infos.len(), cameras)?;
+        same_length("input.base_from_camera", self.input.base_from_camera.len(), cameras)?;
+        same_length("input.image_time_offset_sec", self.input.image_time_offset_sec.len(), cameras)
+    }
+}
+
+fn between(key: &'static str, x: f64, low: f64, high: f64) -> Result<(), ConfigError> {
+    // Phrased as what is accepted, so that NaN is refused.
+    if x >= low && x <= high {
+        return Ok(());
+    }
+    Err(ConfigError::Value { key, value: x.to_string(), expected: format!("wants {low} to {high}") })
+}
+
+fn count(key: &'static str, x: usize, low: usize, high: usize) -> Result<(), ConfigError> {
+    if (low..=high).contains(&x) {
+        return Ok(());
+    }
+    Err(ConfigError::Value { key, value: x.to_string(), expected: format!("wants {low} to {high}") })
+}
+
+fn one_of(key: &'static str, x: &str, allowed: &[&str]) -> Result<(), ConfigError> {
+    if allowed.contains(&x) {
+        return Ok(());
+    }
+    Err(ConfigError::Value { key, value: x.into(), expected: format!("wants one of {}", allowed.join(", ")) })
+}
+
+/// A per-camera list must be empty or have one entry per camera; with unnamed cameras any length may fit.
+fn same_length(key: &'static str, n: usize, cameras: usize) -> Result<(), ConfigError> {
+    if n == 0 || cameras == 0 || n == cameras {
+        return Ok(());
+    }
+    let expected = format!("wants no entry or one per image topic ({cameras})");
+    Err(ConfigError::Value { key, value: format!("{n} entries"), expected })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn out_of_range_values_are_named() {
+        let mut c = Config::default();
+        c.window.stride_sec = f64::NAN;
+        let e = c.validate().unwrap_err().to_string();
+        assert!(e.contains("window.stride_sec") && e.contains("NaN"), "{e}");
+        let mut c = Config::default();
+        c.window.timesteps = 11;
+        assert!(c.validate().unwrap_err().to_string().contains("11"));
+        assert!(Config::default().validate().is_ok());
+    }
+}

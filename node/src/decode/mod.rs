@@ -1,0 +1,1 @@
+//! Camera messages to pictures: raw encodings, compressed files, rectification.

@@ -1,0 +1,19 @@
+//! Sources, sync, window, engine, map, tracks and outputs around the STORM network.
+//!
+//! Data flows one way: `source -> decode -> sync -> window -> engine -> step result -> outputs`, with the map and the
+//! tracks hanging off the step result. Stages are plain values in, plain values out, without threads or clocks.
+
+pub mod bag;
+pub mod cdr;
+pub mod config;
+pub mod decode;
+pub mod map;
+pub mod msg;
+pub mod output;
+pub mod poses;
+pub mod rigid;
+pub mod sync;
+pub mod synth;
+pub mod tf;
+pub mod tracks;
+pub mod window;

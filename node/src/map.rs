@@ -1,0 +1,1 @@
+//! The long-horizon map: static Gaussians merged in voxels.

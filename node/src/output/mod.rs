@@ -1,0 +1,1 @@
+//! What a run leaves behind: PLY, CSV, TUM, MCAP, pictures and the report.

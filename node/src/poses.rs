@@ -1,0 +1,1 @@
+//! Vehicle poses over time, interpolated and never extrapolated.

@@ -1,0 +1,1 @@
+//! Images of several cameras brought together around a reference stamp.

@@ -1,0 +1,1 @@
+//! A procedural drive written as a bag, ground truth included.

@@ -1,0 +1,1 @@
+//! A transform tree over time (/tf and /tf_static), in f64.

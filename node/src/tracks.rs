@@ -1,0 +1,1 @@
+//! Point trajectories chained from scene flow.

@@ -1,0 +1,1 @@
+//! Splatting: forward rasterisation of 3D Gaussians on the CPU.

@@ -1,0 +1,1 @@
+//! The procedural drive: a seeded street with exact ground truth.
