@@ -40,7 +40,11 @@ impl StarvationReport {
             let name = topics.get(i).map_or_else(|| format!("camera {i}"), Clone::clone);
             out += &format!(" {name} {} images", t.images);
             if let Some(stamp_ns) = t.newest_stamp_ns {
-                out += &format!(" (newest stamp {}.{:09})", stamp_ns.div_euclid(1_000_000_000), stamp_ns.rem_euclid(1_000_000_000));
+                out += &format!(
+                    " (newest stamp {}.{:09})",
+                    stamp_ns.div_euclid(1_000_000_000),
+                    stamp_ns.rem_euclid(1_000_000_000)
+                );
             }
             out += if i + 1 < self.topics.len() { "," } else { ";" };
         }
@@ -113,7 +117,8 @@ impl StarvationWatch {
             return None;
         }
         self.quiet_since = Some((now_ns, self.sets));
-        let topics = self.cameras.iter().map(|s| TopicReport { images: s.images, newest_stamp_ns: s.newest_ns }).collect();
+        let topics =
+            self.cameras.iter().map(|s| TopicReport { images: s.images, newest_stamp_ns: s.newest_ns }).collect();
         Some(StarvationReport { quiet_sec, topics, nearest_gap_sec: self.nearest_gap_sec(), slop_sec: self.slop_sec })
     }
 

@@ -94,7 +94,11 @@ fn a_constant_shift_between_cameras_is_reported_as_the_nearest_gap() {
     }
     let report = report.unwrap();
     assert!((report.nearest_gap_sec.unwrap() - 0.04).abs() < 1e-9);
-    assert!(report.describe(&[]).contains("nearest stamp gap 0.040 s against sync.slop_sec 0.020"), "{}", report.describe(&[]));
+    assert!(
+        report.describe(&[]).contains("nearest stamp gap 0.040 s against sync.slop_sec 0.020"),
+        "{}",
+        report.describe(&[])
+    );
 }
 
 #[test]
