@@ -7,6 +7,7 @@ pub mod bag;
 pub mod cdr;
 pub mod config;
 pub mod decode;
+pub mod extrinsics;
 pub mod map;
 pub mod msg;
 pub mod output;

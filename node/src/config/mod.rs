@@ -49,6 +49,8 @@ section! {
         pose_wait_sec: f64 = 0.5,
         /// Largest gap between two poses that is still interpolated across, seconds.
         pose_gap_sec: f64 = 0.5,
+        /// Most images of one camera that wait for the others; the oldest is dropped beyond it.
+        max_pending: usize = 64,
         /// After this long without a set the starvation report is given, seconds.
         starvation_sec: f64 = 5.0,
         /// A stamp that goes back by more than this is a clock jump: window and sync start anew, seconds.
@@ -119,6 +121,10 @@ section! {
         min_opacity: f64 = 0.3,
         /// A trajectory continues at the nearest Gaussian within this distance of its predicted place, metres.
         gate_m: f64 = 0.5,
+        /// A trajectory without a Gaussian near its predicted place for longer than this ends, seconds.
+        bridge_sec: f64 = 0.6,
+        /// New trajectories start at least this far from all others, metres.
+        spacing_m: f64 = 0.5,
         /// Trajectories shorter than this many points are not written.
         min_points: usize = 3,
         /// Most trajectories kept alive at once.

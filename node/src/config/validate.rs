@@ -11,6 +11,7 @@ impl Config {
         between("sync.pose_wait_sec", sync.pose_wait_sec, 0.0, 60.0)?;
         between("sync.pose_gap_sec", sync.pose_gap_sec, 1e-6, 60.0)?;
         between("sync.starvation_sec", sync.starvation_sec, 0.1, 3600.0)?;
+        count("sync.max_pending", sync.max_pending, 1, 100_000)?;
         between("sync.jump_back_sec", sync.jump_back_sec, 1e-3, 3600.0)?;
         between("sync.jump_forward_sec", sync.jump_forward_sec, 0.1, 86400.0)?;
         count("window.timesteps", window.timesteps, 1, 10)?;
@@ -26,6 +27,8 @@ impl Config {
         between("tracks.min_speed_mps", self.tracks.min_speed_mps, 0.0, 1000.0)?;
         between("tracks.min_opacity", self.tracks.min_opacity, 0.0, 1.0)?;
         between("tracks.gate_m", self.tracks.gate_m, 1e-3, 100.0)?;
+        between("tracks.bridge_sec", self.tracks.bridge_sec, 0.0, 60.0)?;
+        between("tracks.spacing_m", self.tracks.spacing_m, 1e-3, 100.0)?;
         count("tracks.min_points", self.tracks.min_points, 1, 1_000_000)?;
         count("tracks.max_active", self.tracks.max_active, 1, 10_000_000)?;
         between("output.min_opacity", self.output.min_opacity, 0.0, 1.0)?;

@@ -1,1 +1,0 @@
-//! Vehicle poses over time, interpolated and never extrapolated.

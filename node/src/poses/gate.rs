@@ -1,0 +1,101 @@
+//! Synchronized sets wait here until every image has a pose at its own stamp.
+
+use std::collections::VecDeque;
+
+use super::{PoseLookup, PoseMissing};
+use crate::config::SyncConfig;
+use crate::sync::clock::signed_ns;
+use crate::sync::{DropCounts, DropReason, FrameSet};
+use crate::window::{PosedFrame, PosedSet};
+
+/// Most sets that wait for poses at once. At camera rates it is several times what `pose_wait_sec` lets wait; it bounds
+/// memory when message time stands still.
+const MAX_WAITING_SETS: usize = 64;
+
+/// Gives sets their poses, in order, with a bounded wait.
+#[derive(Debug)]
+pub struct PoseGate<T> {
+    wait_ns: i64,
+    waiting: VecDeque<FrameSet<T>>,
+    drops: DropCounts,
+}
+
+impl<T> PoseGate<T> {
+    /// Sets wait at most `pose_wait_sec` after their newest image.
+    pub fn new(config: &SyncConfig) -> Self {
+        Self { wait_ns: signed_ns(config.pose_wait_sec), waiting: VecDeque::new(), drops: DropCounts::default() }
+    }
+
+    /// Takes the next set; beyond the bound the oldest one that waits is dropped.
+    pub fn push(&mut self, set: FrameSet<T>) {
+        self.waiting.push_back(set);
+        if self.waiting.len() > MAX_WAITING_SETS {
+            self.drop_front(DropReason::Overflow);
+        }
+    }
+
+    /// The next set with all its poses; none when the oldest one still waits, or none is left.
+    ///
+    /// `now_ns` is message time (the newest stamp of any input); `map_from_camera` gives the camera's pose at a stamp.
+    pub fn poll(
+        &mut self,
+        now_ns: i64,
+        mut map_from_camera: impl FnMut(usize, i64) -> PoseLookup,
+    ) -> Option<PosedSet<T>> {
+        while let Some(front) = self.waiting.front() {
+            let poses: Vec<_> = front.frames.iter().enumerate().map(|(c, (s, _))| map_from_camera(c, *s)).collect();
+            let never = poses.iter().find_map(|p| match p {
+                PoseLookup::Never(PoseMissing::BeforeFirst { .. }) => Some(DropReason::NoPose),
+                PoseLookup::Never(PoseMissing::GapTooWide { .. }) => Some(DropReason::PoseGap),
+                _ => None,
+            });
+            if let Some(reason) = never {
+                self.drop_front(reason);
+                continue;
+            }
+            let poses: Vec<_> =
+                poses.into_iter().filter_map(|p| if let PoseLookup::At(t) = p { Some(t) } else { None }).collect();
+            if poses.len() == front.frames.len() {
+                let set = self.waiting.pop_front()?;
+                let frames = set.frames.into_iter().zip(poses);
+                let frames = frames
+                    .map(|((stamp_ns, item), map_from_camera)| PosedFrame { stamp_ns, map_from_camera, item })
+                    .collect();
+                return Some(PosedSet { stamp_ns: set.stamp_ns, epoch: set.epoch, frames });
+            }
+            let newest_ns = front.frames.iter().map(|(s, _)| *s).max().unwrap_or(front.stamp_ns);
+            if self.waiting.back().is_some_and(|b| b.epoch != front.epoch) {
+                // The clock has jumped since: the poses this set waits for belong to a time that is over.
+                self.drop_front(DropReason::ClockJump);
+            } else if now_ns > newest_ns.saturating_add(self.wait_ns) {
+                self.drop_front(DropReason::NoPose);
+            } else {
+                return None;
+            }
+        }
+        None
+    }
+
+    /// End of the recording: drops what still waits.
+    pub fn flush(&mut self) {
+        while !self.waiting.is_empty() {
+            self.drop_front(DropReason::NoPose);
+        }
+    }
+
+    /// Dropped images by reason.
+    pub fn drops(&self) -> &DropCounts {
+        &self.drops
+    }
+
+    /// Images that wait.
+    pub fn pending(&self) -> usize {
+        self.waiting.iter().map(|s| s.frames.len()).sum()
+    }
+
+    fn drop_front(&mut self, reason: DropReason) {
+        if let Some(set) = self.waiting.pop_front() {
+            self.drops.add(reason, set.frames.len() as u64);
+        }
+    }
+}

@@ -1,0 +1,129 @@
+//! A rigid transform over time: sorted samples, bounded, interpolated and never extrapolated.
+
+use std::collections::VecDeque;
+
+use super::check::{PoseNote, PoseReject, checked};
+use crate::rigid::Rigid;
+use crate::sync::clock::{ClockGuard, seconds_between, unsigned_ns};
+
+/// Why there is no pose for a stamp, and never will be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PoseMissing {
+    /// The stamp is older than the oldest pose.
+    BeforeFirst {
+        /// The oldest pose's stamp.
+        first_ns: i64,
+    },
+    /// The poses on both sides are too far apart.
+    GapTooWide {
+        /// Their distance, seconds.
+        gap_sec: f64,
+    },
+}
+
+/// The pose at a stamp.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PoseLookup {
+    /// Interpolated, or exact.
+    At(Rigid),
+    /// The stamp is newer than the newest pose; ask again when there are more.
+    Wait,
+    /// There is none and waiting does not help.
+    Never(PoseMissing),
+}
+
+/// Samples of one transform, sorted by stamp.
+#[derive(Debug)]
+pub(crate) struct Timeline {
+    samples: VecDeque<(i64, Rigid)>,
+    capacity: usize,
+    gap_ns: u64,
+    clock: ClockGuard<Rigid>,
+}
+
+impl Timeline {
+    /// Keeps at most `capacity` samples and interpolates across at most `gap_sec`.
+    pub fn new(capacity: usize, gap_sec: f64, jump_back_sec: f64, jump_forward_sec: f64) -> Self {
+        Self {
+            samples: VecDeque::new(),
+            capacity: capacity.max(2),
+            gap_ns: unsigned_ns(gap_sec),
+            clock: ClockGuard::new(jump_back_sec, jump_forward_sec),
+        }
+    }
+
+    /// Takes one sample; out of order is fine.
+    pub fn push(&mut self, stamp_ns: i64, transform: Rigid) -> Result<PoseNote, PoseReject> {
+        let (transform, note) = checked(&transform)?;
+        let admission = self.clock.admit(stamp_ns, transform);
+        if admission.jumped {
+            self.samples.clear();
+        }
+        if admission.accepted.is_empty() {
+            return Ok(PoseNote::Held);
+        }
+        let mut result = Ok(note);
+        for (stamp_ns, transform) in admission.accepted {
+            // The last one is the sample given here; the outcome reported is its.
+            result = self.insert(stamp_ns, transform).map(|fresh| if fresh { note } else { PoseNote::Duplicate });
+        }
+        if admission.jumped { result.map(|_| PoseNote::ClockJump) } else { result }
+    }
+
+    /// False when there is a sample with this stamp already; the first one stays.
+    fn insert(&mut self, stamp_ns: i64, transform: Rigid) -> Result<bool, PoseReject> {
+        let at = self.samples.partition_point(|(s, _)| *s < stamp_ns);
+        if self.samples.get(at).is_some_and(|(s, _)| *s == stamp_ns) {
+            return Ok(false);
+        }
+        if self.samples.len() < self.capacity {
+            self.samples.insert(at, (stamp_ns, transform));
+        } else if at == 0 {
+            return Err(PoseReject::TooOld);
+        } else {
+            self.samples.pop_front();
+            self.samples.insert(at - 1, (stamp_ns, transform));
+        }
+        Ok(true)
+    }
+
+    /// The transform at a stamp, linear in position and spherical in rotation between the two samples around it.
+    pub fn lookup(&self, stamp_ns: i64) -> PoseLookup {
+        let at = self.samples.partition_point(|(s, _)| *s < stamp_ns);
+        let Some(&(after_ns, after)) = self.samples.get(at) else { return PoseLookup::Wait };
+        if after_ns == stamp_ns {
+            return PoseLookup::At(after);
+        }
+        let Some(&(before_ns, before)) = at.checked_sub(1).and_then(|i| self.samples.get(i)) else {
+            return PoseLookup::Never(PoseMissing::BeforeFirst { first_ns: after_ns });
+        };
+        let gap_ns = after_ns.abs_diff(before_ns);
+        if gap_ns > self.gap_ns {
+            return PoseLookup::Never(PoseMissing::GapTooWide { gap_sec: seconds_between(before_ns, after_ns) });
+        }
+        let alpha = stamp_ns.abs_diff(before_ns) as f64 / gap_ns as f64;
+        PoseLookup::At(before.interpolate(&after, alpha))
+    }
+
+    /// The newest sample's stamp.
+    pub fn latest_ns(&self) -> Option<i64> {
+        self.samples.back().map(|(s, _)| *s)
+    }
+
+    /// Samples kept.
+    pub fn len(&self) -> usize {
+        self.samples.len()
+    }
+
+    /// True when `stamp_ns` is of the time base of these samples (or there are none).
+    pub fn same_time_base(&self, stamp_ns: i64) -> bool {
+        self.latest_ns()
+            .is_none_or(|latest_ns| self.clock.near(latest_ns, stamp_ns) || self.clock.near(stamp_ns, latest_ns))
+    }
+
+    /// Forgets everything.
+    pub fn clear(&mut self) {
+        self.samples.clear();
+        self.clock.reset();
+    }
+}

@@ -1,1 +1,0 @@
-//! Images of several cameras brought together around a reference stamp.

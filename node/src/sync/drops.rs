@@ -1,0 +1,124 @@
+//! Why images were dropped, and how many.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use serde::Serialize;
+
+/// Why an image never reached the network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DropReason {
+    /// Older than a set that was already emitted, or than the sync timeout.
+    Late,
+    /// A second image of one camera with the same stamp.
+    Duplicate,
+    /// Its set never became complete: a camera's image is missing, or this camera sends more often than the others.
+    Incomplete,
+    /// No pose for its stamp: older than the first pose, or none came within the bounded wait.
+    NoPose,
+    /// The poses around its stamp lie too far apart to be interpolated.
+    PoseGap,
+    /// No usable intrinsics or mounting for its camera.
+    NoCalibration,
+    /// Held when the clock jumped, the recording looped, or the stage was reset; or its own stamp is far from all others.
+    ClockJump,
+    /// Its bytes cannot be decoded.
+    Decode,
+    /// A bounded queue was full; the oldest goes first.
+    Overflow,
+}
+
+impl DropReason {
+    /// The name used in logs and `metrics.json`.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Late => "late",
+            Self::Duplicate => "duplicate",
+            Self::Incomplete => "incomplete",
+            Self::NoPose => "no_pose",
+            Self::PoseGap => "pose_gap",
+            Self::NoCalibration => "no_calibration",
+            Self::ClockJump => "clock_jump",
+            Self::Decode => "decode",
+            Self::Overflow => "overflow",
+        }
+    }
+}
+
+impl fmt::Display for DropReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// Dropped images by reason, in the order of [`DropReason`]; serialises as one object, reason to count.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+#[serde(transparent)]
+pub struct DropCounts(BTreeMap<DropReason, u64>);
+
+impl DropCounts {
+    /// Counts `n` more images; 0 leaves no entry behind.
+    pub fn add(&mut self, reason: DropReason, n: u64) {
+        if n > 0 {
+            *self.0.entry(reason).or_insert(0) += n;
+        }
+    }
+
+    /// Images dropped for this reason.
+    pub fn get(&self, reason: DropReason) -> u64 {
+        self.0.get(&reason).copied().unwrap_or(0)
+    }
+
+    /// Images dropped for any reason.
+    pub fn total(&self) -> u64 {
+        self.0.values().sum()
+    }
+
+    /// Reasons that occurred, with their counts.
+    pub fn iter(&self) -> impl Iterator<Item = (DropReason, u64)> + '_ {
+        self.0.iter().map(|(&reason, &n)| (reason, n))
+    }
+
+    /// Adds another stage's counts.
+    pub fn merge(&mut self, other: &Self) {
+        for (reason, n) in other.iter() {
+            self.add(reason, n);
+        }
+    }
+}
+
+impl fmt::Display for DropCounts {
+    /// `incomplete 3, late 1`, or `none`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.0.is_empty() {
+            return f.write_str("none");
+        }
+        for (i, (reason, n)) in self.iter().enumerate() {
+            write!(f, "{}{reason} {n}", if i == 0 { "" } else { ", " })?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_agree_and_counts_add_up() {
+        let mut a = DropCounts::default();
+        a.add(DropReason::Late, 2);
+        a.add(DropReason::NoPose, 0);
+        let mut b = DropCounts::default();
+        b.add(DropReason::NoCalibration, 1);
+        b.merge(&a);
+        assert_eq!((b.total(), b.get(DropReason::Late), b.get(DropReason::NoPose)), (3, 2, 0));
+        assert_eq!(serde_json::to_string(&b).unwrap(), r#"{"late":2,"no_calibration":1}"#);
+        assert_eq!(b.to_string(), "late 2, no_calibration 1");
+        assert_eq!(DropCounts::default().to_string(), "none");
+        for (reason, _) in b.iter() {
+            assert_eq!(serde_json::to_string(&reason).unwrap(), format!("\"{reason}\""));
+        }
+    }
+}

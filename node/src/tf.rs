@@ -1,1 +1,0 @@
-//! A transform tree over time (/tf and /tf_static), in f64.

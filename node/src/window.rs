@@ -1,1 +1,0 @@
-//! The sliding window the network sees.

@@ -1,0 +1,177 @@
+//! Choosing the timesteps of a window.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use super::{PosedSet, Window, camera_from_flu};
+use crate::config::WindowConfig;
+use crate::sync::clock::{seconds_between, signed_ns, unsigned_ns};
+
+/// A set may come this part of `hop_sec` early and still make a step: stamps jitter, and a hop equal to the camera's period
+/// must not lose every second set.
+const HOP_TOLERANCE: f64 = 0.05;
+
+/// What became of the sets.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct WindowCounts {
+    /// Gave a window.
+    pub windows: u64,
+    /// Gave none: the epoch is too young to fill one.
+    pub filling: u64,
+    /// Gave none: too soon after the last one.
+    pub hop: u64,
+    /// Gave none: a timestep has no set near its place.
+    pub gap: u64,
+    /// Refused: not newer than the newest set of its epoch, or of an epoch that is over.
+    pub out_of_order: u64,
+    /// Refused: no reference camera, a different number of cameras than before, or a pose that is not finite.
+    pub malformed: u64,
+}
+
+#[derive(Debug)]
+pub(super) struct Kept<T> {
+    pub(super) set: Arc<PosedSet<T>>,
+    in_window: bool,
+}
+
+/// Builds windows from posed sets as they come.
+#[derive(Debug)]
+pub struct WindowBuilder<T> {
+    timesteps: usize,
+    stride_ns: i64,
+    tolerance_ns: u64,
+    hop_ns: u64,
+    reference_camera: usize,
+    pub(super) history: VecDeque<Kept<T>>,
+    epoch: Option<u32>,
+    first_ns: i64,
+    cameras: usize,
+    last_step_ns: Option<i64>,
+    counts: WindowCounts,
+}
+
+impl<T> WindowBuilder<T> {
+    /// Anchored at `reference_camera`.
+    pub fn new(config: &WindowConfig, reference_camera: usize) -> Self {
+        Self {
+            timesteps: config.timesteps.max(1),
+            stride_ns: signed_ns(config.stride_sec).max(1),
+            tolerance_ns: unsigned_ns(config.stride_sec * config.stride_tolerance),
+            hop_ns: unsigned_ns(config.hop_sec * (1.0 - HOP_TOLERANCE)),
+            reference_camera,
+            history: VecDeque::new(),
+            epoch: None,
+            first_ns: 0,
+            cameras: 0,
+            last_step_ns: None,
+            counts: WindowCounts::default(),
+        }
+    }
+
+    /// Takes the next set; gives the window that ends at it, if there is one.
+    pub fn push(&mut self, set: PosedSet<T>) -> Option<Window<T>> {
+        if !self.keep(set) {
+            return None;
+        }
+        let newest_ns = self.history.back()?.set.stamp_ns;
+        if self.last_step_ns.is_some_and(|last_ns| newest_ns.abs_diff(last_ns) < self.hop_ns) {
+            self.counts.hop += 1;
+            return None;
+        }
+        let Some(picks) = self.pick(newest_ns) else {
+            let oldest_place_ns = self.place_ns(newest_ns, self.timesteps - 1);
+            let filling = i128::from(self.first_ns) > i128::from(oldest_place_ns) + i128::from(self.tolerance_ns);
+            *(if filling { &mut self.counts.filling } else { &mut self.counts.gap }) += 1;
+            return None;
+        };
+        self.counts.windows += 1;
+        self.last_step_ns = Some(newest_ns);
+        self.window(&picks)
+    }
+
+    /// Forgets all sets, as a new epoch does.
+    pub fn reset(&mut self) {
+        self.history.clear();
+        self.epoch = None;
+        self.last_step_ns = None;
+    }
+
+    /// What became of the sets so far.
+    pub fn counts(&self) -> WindowCounts {
+        self.counts
+    }
+
+    /// Sets kept for windows to come.
+    pub fn history(&self) -> usize {
+        self.history.len()
+    }
+
+    /// Adds a set to the history and drops what no window can use any more; false when the set is refused.
+    fn keep(&mut self, set: PosedSet<T>) -> bool {
+        let finite = set.frames.iter().all(|f| f.map_from_camera.is_finite());
+        if self.epoch != Some(set.epoch) {
+            if self.epoch.is_some_and(|epoch| set.epoch < epoch) {
+                self.counts.out_of_order += 1;
+                return false;
+            }
+            if !(finite && self.reference_camera < set.frames.len()) {
+                self.counts.malformed += 1;
+                return false;
+            }
+            self.reset();
+            self.epoch = Some(set.epoch);
+            self.first_ns = set.stamp_ns;
+            self.cameras = set.frames.len();
+        } else if self.history.back().is_some_and(|k| set.stamp_ns <= k.set.stamp_ns) {
+            self.counts.out_of_order += 1;
+            return false;
+        } else if !(finite && set.frames.len() == self.cameras) {
+            self.counts.malformed += 1;
+            return false;
+        }
+        let oldest_ns = self.place_ns(set.stamp_ns, self.timesteps - 1);
+        self.history.push_back(Kept { set: Arc::new(set), in_window: false });
+        let too_old = |stamp_ns: i64| stamp_ns < oldest_ns && stamp_ns.abs_diff(oldest_ns) > self.tolerance_ns;
+        while self.history.front().is_some_and(|k| too_old(k.set.stamp_ns)) {
+            self.history.pop_front();
+        }
+        true
+    }
+
+    /// Where timestep `k` back from the newest should lie.
+    fn place_ns(&self, newest_ns: i64, k: usize) -> i64 {
+        newest_ns.saturating_sub(self.stride_ns.saturating_mul(i64::try_from(k).unwrap_or(i64::MAX)))
+    }
+
+    /// History indices of the window's timesteps, oldest first.
+    fn pick(&self, newest_ns: i64) -> Option<Vec<usize>> {
+        let mut picks = vec![self.history.len().checked_sub(1)?];
+        for k in 1..self.timesteps {
+            let place_ns = self.place_ns(newest_ns, k);
+            let distance = |i: usize| self.history[i].set.stamp_ns.abs_diff(place_ns);
+            // Only sets older than the timestep before can be meant, so the timesteps are distinct and in order.
+            let older = *picks.last()?;
+            let after = self.history.partition_point(|kept| kept.set.stamp_ns < place_ns).min(older);
+            let candidates = after.checked_sub(1).into_iter().chain((after < older).then_some(after));
+            let nearest = candidates.min_by_key(|&i| distance(i)).filter(|&i| distance(i) <= self.tolerance_ns)?;
+            picks.push(nearest);
+        }
+        picks.reverse();
+        Some(picks)
+    }
+
+    fn window(&mut self, picks: &[usize]) -> Option<Window<T>> {
+        let new_steps = picks.iter().rev().take_while(|&&i| !self.history[i].in_window).count();
+        for &i in picks {
+            self.history[i].in_window = true;
+        }
+        let steps: Vec<_> = picks.iter().map(|&i| Arc::clone(&self.history[i].set)).collect();
+        let (first, newest) = (steps.first()?, steps.last()?);
+        let map_from_anchor = first.frames.get(self.reference_camera)?.map_from_camera * camera_from_flu();
+        let since_first = |stamp_ns| seconds_between(first.stamp_ns, stamp_ns);
+        let time_sec = steps.iter().map(|s| s.frames.iter().map(|f| since_first(f.stamp_ns)).collect()).collect();
+        Some(Window { epoch: newest.epoch, stamp_ns: newest.stamp_ns, map_from_anchor, time_sec, new_steps, steps })
+    }
+}

@@ -1,0 +1,144 @@
+use glam::{DMat3, DQuat, DVec3};
+use proptest::prelude::*;
+
+use super::*;
+use crate::config::WindowConfig;
+
+const SEC: i64 = 1_000_000_000;
+const MS: i64 = 1_000_000;
+
+fn set(stamp_ns: i64, epoch: u32, place: DVec3) -> PosedSet<i64> {
+    let map_from_camera = Rigid::new(DQuat::from_rotation_z(0.3), place);
+    PosedSet { stamp_ns, epoch, frames: vec![PosedFrame { stamp_ns, map_from_camera, item: stamp_ns }] }
+}
+
+fn plain(stamp_ns: i64) -> PosedSet<i64> {
+    set(stamp_ns, 0, DVec3::ZERO)
+}
+
+fn stamps(w: &Window<i64>) -> Vec<i64> {
+    w.steps.iter().map(|s| s.stamp_ns).collect()
+}
+
+#[test]
+fn optical_axes_become_forward_left_up_exactly() {
+    let flu_from_camera = camera_from_flu().inverse().matrix3();
+    assert_eq!(flu_from_camera.transpose(), DMat3::from_cols_array(&[0., 0., 1., -1., 0., 0., 0., -1., 0.]));
+    let [right, down, forward] = [DVec3::X, DVec3::Y, DVec3::Z].map(|v| flu_from_camera * v);
+    assert_eq!((right, down, forward), (-DVec3::Y, -DVec3::Z, DVec3::X));
+}
+
+#[test]
+fn at_10_hz_windows_interleave_and_nothing_is_wasted() {
+    // The rate of the recorded stereo drive: 51 sets, 0.1036 s apart.
+    let mut b = WindowBuilder::new(&WindowConfig::default(), 0);
+    let windows: Vec<_> = (0..51).filter_map(|i| b.push(plain(1000 * SEC + i * 103_600_000))).collect();
+    assert_eq!((windows.len(), b.counts().filling, b.counts().gap), (37, 14, 0));
+    let index = |w: &Window<i64>| stamps(w).iter().map(|s| (s - 1000 * SEC) / 103_600_000).collect::<Vec<_>>();
+    assert_eq!(index(&windows[0]), [0, 4, 9, 14]);
+    assert_eq!(index(&windows[36]), [36, 40, 45, 50]);
+    assert_eq!(windows[0].new_steps, 4);
+    assert!(windows[6..].iter().all(|w| w.new_steps == 1));
+    assert!((windows[0].time_sec[3][0] - 1.4504).abs() < 1e-9 && windows[0].time_sec[0][0] == 0.0);
+    assert!(b.history() <= 16, "{}", b.history());
+}
+
+#[test]
+fn hop_skips_sets_but_keeps_them_for_later_windows() {
+    let config = WindowConfig { hop_sec: 0.5, ..Default::default() };
+    let mut b = WindowBuilder::new(&config, 0);
+    let windows: Vec<_> = (0..51).filter_map(|i| b.push(plain(i * 100 * MS + (i % 2) * MS))).collect();
+    assert_eq!(windows.iter().map(|w| w.stamp_ns / (100 * MS)).collect::<Vec<_>>(), [14, 19, 24, 29, 34, 39, 44, 49]);
+    assert_eq!(windows.iter().map(|w| w.new_steps).collect::<Vec<_>>(), [4, 1, 1, 1, 1, 1, 1, 1]);
+    assert_eq!(b.counts().hop, 29);
+}
+
+#[test]
+fn one_timestep_is_a_window_at_every_set() {
+    let mut b = WindowBuilder::new(&WindowConfig { timesteps: 1, ..Default::default() }, 0);
+    for i in 0..5 {
+        let w = b.push(plain(i * 700 * MS)).unwrap();
+        assert_eq!((w.steps.len(), w.new_steps, b.history()), (1, 1, 1));
+    }
+}
+
+#[test]
+fn a_gap_costs_the_windows_that_need_it_only() {
+    let mut b = WindowBuilder::new(&WindowConfig::default(), 0);
+    let windows = (0..100).filter(|i| !(40..44).contains(i)).filter_map(|i| b.push(plain(i * 100 * MS))).count();
+    // Without sets 40 to 43 the places at 41.5 +- 0.25 have none: each of the three older timesteps meets it once or twice.
+    assert_eq!((b.counts().filling, windows + b.counts().gap as usize), (14, 82));
+    assert!((3..=6).contains(&b.counts().gap), "{:?}", b.counts());
+}
+
+#[test]
+fn a_new_epoch_starts_anew_and_old_or_odd_sets_are_refused() {
+    let mut b = WindowBuilder::new(&WindowConfig::default(), 0);
+    for i in 0..20 {
+        b.push(set(i * 100 * MS, 3, DVec3::ZERO));
+    }
+    assert!(b.push(set(0, 4, DVec3::ZERO)).is_none());
+    assert_eq!((b.history(), b.counts().filling), (1, 14 + 1));
+    assert!(b.push(set(2100 * MS, 3, DVec3::ZERO)).is_none());
+    assert!(b.push(set(0, 4, DVec3::ZERO)).is_none());
+    assert_eq!(b.counts().out_of_order, 2);
+    assert!(b.push(PosedSet { stamp_ns: SEC, epoch: 4, frames: vec![] }).is_none());
+    assert!(b.push(set(SEC, 4, DVec3::NAN)).is_none());
+    assert_eq!((b.counts().malformed, b.history()), (2, 1));
+    assert!(WindowBuilder::new(&WindowConfig::default(), 1).push(plain(0)).is_none());
+    let windows: Vec<_> = (1..16).filter_map(|i| b.push(set(i * 100 * MS, 4, DVec3::ZERO))).collect();
+    assert_eq!(windows.iter().map(|w| (w.epoch, w.new_steps)).collect::<Vec<_>>(), [(4, 4), (4, 3)]);
+}
+
+#[test]
+fn utm_sized_places_lose_nothing() {
+    let drive = |origin: DVec3| {
+        let mut b = WindowBuilder::new(&WindowConfig::default(), 0);
+        let place = |i: i64| origin + DVec3::new(1.03 * i as f64, 0.37 * i as f64, 0.01 * i as f64);
+        (0..16).find_map(|i| b.push(set(i * 100 * MS, 0, place(i)))).unwrap()
+    };
+    let (near, far) = (drive(DVec3::ZERO), drive(DVec3::new(4_500_000.7, -650_000.3, 120.1)));
+    for step in 0..4 {
+        let (a, b) = (near.anchor_from_camera(step, 0), far.anchor_from_camera(step, 0));
+        // f64 resolves 1e-9 m at 4500 km; two such positions are subtracted.
+        assert!((a.translation - b.translation).length() < 4e-9, "{}", (a.translation - b.translation).length());
+        assert!(a.rotation.angle_between(b.rotation) < 1e-7);
+    }
+    // The anchor is the reference camera of the first timestep with its axes exchanged.
+    assert_eq!(near.anchor_from_camera(0, 0).translation, DVec3::ZERO);
+    assert!((near.anchor_from_camera(0, 0).apply(DVec3::Z) - DVec3::X).length() < 1e-15);
+}
+
+proptest! {
+    /// Against the obvious version: nearest set to each place by search over everything.
+    #[test]
+    fn timesteps_are_the_nearest_sets(
+        gaps_ms in proptest::collection::vec(1i64..400, 1..80), timesteps in 1usize..6, start_ns in 0i64..(1 << 62),
+        stride_sec in 0.1f64..1.0, stride_tolerance in 0.0f64..0.5,
+    ) {
+        let config = WindowConfig { timesteps, stride_sec, stride_tolerance, ..Default::default() };
+        let mut b = WindowBuilder::new(&config, 0);
+        let (mut all, mut t) = (Vec::new(), start_ns);
+        for gap_ms in gaps_ms {
+            t += gap_ms * MS;
+            all.push(t);
+            let window = b.push(plain(t));
+            let places: Vec<i64> = (0..timesteps).map(|k| t - k as i64 * (stride_sec * 1e9).round() as i64).collect();
+            let near = |place: i64| all.iter().map(|s| s.abs_diff(place)).min().unwrap_or(u64::MAX);
+            let possible = places.iter().all(|&p| near(p) <= (stride_sec * stride_tolerance * 1e9).round() as u64);
+            prop_assert_eq!(window.is_some(), possible);
+            if let Some(w) = window {
+                let picked = stamps(&w);
+                prop_assert!(picked.windows(2).all(|p| p[0] < p[1]));
+                for (s, &p) in picked.iter().rev().zip(&places) {
+                    prop_assert_eq!(s.abs_diff(p), near(p));
+                }
+                prop_assert!(w.new_steps >= 1 && w.time_sec.len() == timesteps);
+            }
+            let span = b.history.back().unwrap().set.stamp_ns.abs_diff(b.history.front().unwrap().set.stamp_ns);
+            prop_assert!(span as f64 * 1e-9 <= stride_sec * (timesteps as f64 - 1.0 + stride_tolerance) + 1e-6);
+        }
+        let c = b.counts();
+        prop_assert_eq!(c.windows + c.filling + c.gap, all.len() as u64);
+    }
+}
