@@ -1,1 +1,15 @@
 //! What a run leaves behind: PLY, CSV, TUM, MCAP, pictures and the report.
+
+pub mod atomic;
+pub mod bag_metadata;
+pub mod bag_writer;
+pub mod cloud;
+pub mod error;
+pub mod picture;
+pub mod ply;
+pub mod qos;
+//report
+pub mod tracks_csv;
+pub mod tum;
+
+pub use error::OutputError;
