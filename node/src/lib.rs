@@ -5,14 +5,19 @@
 
 pub mod bag;
 pub mod cdr;
+pub mod cmd;
 pub mod config;
 pub mod decode;
+pub mod engine;
 pub mod extrinsics;
 pub mod map;
 pub mod msg;
 pub mod output;
+pub mod pipeline;
 pub mod poses;
 pub mod rigid;
+pub mod saved;
+pub mod source;
 pub mod sync;
 pub mod synth;
 pub mod tf;

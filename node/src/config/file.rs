@@ -63,6 +63,23 @@ impl Config {
         Ok(config)
     }
 
+    /// This configuration with one key changed: `section.key=value`, the value as YAML.
+    pub fn with_override(&self, assignment: &str) -> Result<Self, ConfigError> {
+        let wrong = |message: String| ConfigError::Parse { path: format!("--set {assignment}"), message };
+        let (name, value) = assignment.split_once('=').ok_or_else(|| wrong("wants KEY=VALUE".into()))?;
+        let (section, key) = name.trim().split_once('.').ok_or_else(|| wrong("the key wants section.key".into()))?;
+        let parse = |e: serde_yaml::Error| wrong(e.to_string());
+        let mut tree = serde_yaml::to_value(self).map_err(parse)?;
+        let value: serde_yaml::Value = serde_yaml::from_str(value).map_err(parse)?;
+        match tree.get_mut(section).and_then(|s| s.get_mut(key)) {
+            Some(place) => *place = value,
+            None => return Err(wrong(format!("no parameter {name}; `storm config` lists them"))),
+        }
+        let config: Self = serde_yaml::from_value(tree).map_err(parse)?;
+        config.validate()?;
+        Ok(config)
+    }
+
     /// The configuration as YAML, every key shown.
     pub fn to_yaml(&self) -> String {
         serde_yaml::to_string(self).unwrap_or_default()
@@ -85,6 +102,17 @@ mod tests {
         assert_eq!(Config::from_yaml("").unwrap(), Config::default());
         let e = Config::from_yaml("window: {strid_sec: 0.4}").unwrap_err().to_string();
         assert!(e.contains("strid_sec"), "{e}");
+    }
+
+    #[test]
+    fn one_key_can_be_overridden() {
+        let c = Config::default().with_override("window.stride_sec=0.4").unwrap();
+        assert_eq!(c.window.stride_sec, 0.4);
+        let c = c.with_override("input.images=[/a, /b]").unwrap();
+        assert_eq!((c.window.stride_sec, c.input.images.len()), (0.4, 2));
+        for bad in ["window.stride=0.4", "window.stride_sec", "window.stride_sec=fast", "window.timesteps=-1"] {
+            assert!(Config::default().with_override(bad).is_err(), "{bad}");
+        }
     }
 
     #[test]

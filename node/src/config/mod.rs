@@ -3,6 +3,7 @@
 //! Each section is written with `section!`, which keeps a field's doc comment as the text `storm config` and the README
 //! table print. Unknown keys are refused; every value is checked by [`Config::validate`].
 
+mod docs;
 mod file;
 mod section;
 mod validate;

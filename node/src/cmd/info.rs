@@ -1,0 +1,47 @@
+//! `storm info`: what a bag holds, and how it would be used.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+
+use super::Outcome;
+use crate::bag::Bag;
+use crate::config::Config;
+use crate::source::TopicPlan;
+use crate::source::topics::PoseTopic;
+
+/// Arguments of `storm info`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// MCAP or sqlite3 bag, file or folder.
+    bag: PathBuf,
+    /// Configuration file (YAML).
+    #[arg(long)]
+    config: Option<PathBuf>,
+}
+
+/// Prints the topics and the parts they would play.
+pub fn run(args: &Args) -> Result<Outcome> {
+    let config = match &args.config {
+        Some(path) => Config::load(path)?,
+        None => Config::default(),
+    };
+    let bag = Bag::open(&args.bag).with_context(|| format!("cannot read bag {}", args.bag.display()))?;
+    let seconds = (bag.end_ns() as f64 - bag.start_ns() as f64) * 1e-9;
+    println!("{}: {} messages over {seconds:.2} s", args.bag.display(), bag.message_count());
+    for t in bag.topics() {
+        println!("  {:>7}  {}  {} ({})", t.count, t.name, t.type_name, t.serialization);
+    }
+    let problems = bag.problems();
+    problems.iter().for_each(|p| println!("problem: {p}"));
+    let plan = TopicPlan::resolve(bag.topics(), &config.input)?;
+    for (i, c) in plan.cameras.iter().enumerate() {
+        println!("camera {i}: {} with {}", c.name, bag.topics()[c.info].name);
+    }
+    match plan.pose {
+        PoseTopic::Message(t) => println!("pose: {}", bag.topics()[t].name),
+        PoseTopic::Tf => println!("pose: /tf, {} from the vehicle frame", config.input.map_frame),
+    }
+    println!("ground truth: {} topics", plan.truth.len());
+    Ok(if problems.is_empty() { Outcome::Done } else { Outcome::Lost })
+}

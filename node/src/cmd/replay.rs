@@ -1,0 +1,97 @@
+//! `storm replay`: a recorded bag to a results folder.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+
+use super::{Outcome, UsageError, progress_bar};
+use crate::config::Config;
+use crate::pipeline::replay::{self, ReplayOptions, default_out};
+
+/// Arguments of `storm replay`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// MCAP or sqlite3 bag, file or folder.
+    bag: PathBuf,
+    #[command(flatten)]
+    common: Common,
+}
+
+/// Arguments that `replay` and `demo` share.
+#[derive(Debug, clap::Args)]
+pub struct Common {
+    /// Results folder [default: storm_out/<bag>].
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// Configuration file (YAML, plain or ROS 2 parameters).
+    #[arg(long)]
+    pub config: Option<PathBuf>,
+    /// Weights: .safetensors, or a PyTorch .pth/.pt checkpoint.
+    #[arg(long)]
+    pub weights: Option<PathBuf>,
+    /// Where the network runs: cpu, cuda, metal.
+    #[arg(long)]
+    pub device: Option<String>,
+    /// Override one configuration key: --set window.stride_sec=0.4 (repeatable).
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+}
+
+impl Common {
+    /// The configuration: file, then overrides, then flags.
+    pub fn config(&self) -> Result<Config> {
+        let mut config = match &self.config {
+            Some(path) => Config::load(path)?,
+            None => Config::default(),
+        };
+        for assignment in &self.set {
+            config = config.with_override(assignment)?;
+        }
+        if let Some(weights) = &self.weights {
+            config.model.weights = weights.display().to_string();
+        }
+        if let Some(device) = &self.device {
+            config.model.device = device.clone();
+        }
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+/// Replays the bag.
+pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
+    let out = args.common.out.clone().unwrap_or_else(|| default_out(&args.bag));
+    run_into(&args.bag, &out, args.common.config()?, progress)
+}
+
+/// Replays `bag` into `out` and prints what came of it.
+pub(super) fn run_into(bag: &Path, out: &Path, config: Config, progress: bool) -> Result<Outcome> {
+    if out.exists() && !out.is_dir() {
+        return Err(UsageError(format!("--out {} is a file; give a folder", out.display())).into());
+    }
+    if config.model.threads > 0 {
+        // Fails only when a pool was set up before in this process; then that one is kept.
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(config.model.threads).build_global();
+    }
+    let bar = progress_bar(progress, 0, "replaying");
+    let options = ReplayOptions { bag: bag.to_path_buf(), out: out.to_path_buf(), config };
+    let metrics = replay::run(&options, &|done, total| {
+        bar.set_length(total);
+        bar.set_position(done);
+    });
+    bar.finish_and_clear();
+    let metrics = metrics?;
+    println!("{}", out.join("report.html").display());
+    println!(
+        "{} frames, {} steps, {} map Gaussians, {} trajectories; weights: {}",
+        metrics.frames_in, metrics.steps, metrics.map_gaussians, metrics.tracks, metrics.weights
+    );
+    if let Some(s) = &metrics.held_out {
+        println!("{}", s.line());
+    }
+    if metrics.lost() {
+        eprintln!("lost: {}", metrics.loss_line());
+        return Ok(Outcome::Lost);
+    }
+    Ok(Outcome::Done)
+}

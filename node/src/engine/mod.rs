@@ -1,0 +1,166 @@
+//! One window in, one scene out: the network and the renderer behind plain values.
+
+pub mod score;
+pub mod select;
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use candle_core::Device;
+use storm_model::config::ModelConfig;
+use storm_model::scene::{RenderedView, Scene, Want};
+use storm_model::{ClipBatch, PixelLayout, Storm, ViewInput};
+use storm_render::{Intrinsics, View};
+use storm_render::raster::{CpuRasterizer, RasterSettings};
+
+use crate::config::ModelConfigSection;
+use crate::rigid::Rigid;
+use crate::source::Frame;
+use crate::window::{PosedSet, Window};
+
+/// How the weights a run used are called in metrics.json and the report when there are none.
+pub const UNTRAINED: &str = "untrained";
+
+/// The architecture and, if there is a weights file, the weights: known before the cameras are.
+pub enum ModelSource {
+    /// Read from a file.
+    Loaded {
+        /// The network.
+        model: Box<Storm>,
+        /// The file.
+        name: String,
+    },
+    /// Seeded random weights, made once the number of cameras is known.
+    Untrained {
+        /// The architecture.
+        config: Box<ModelConfig>,
+        /// The seed.
+        seed: u64,
+    },
+}
+
+impl ModelSource {
+    /// Reads the weights file of the configuration, or settles on the preset with random weights.
+    pub fn open(section: &ModelConfigSection) -> Result<Self> {
+        if section.weights.is_empty() {
+            let config = ModelConfig::preset(&section.preset).map_err(|e| crate::cmd::UsageError(e.to_string()))?;
+            return Ok(Self::Untrained { config: Box::new(config), seed: section.untrained_seed });
+        }
+        let path = Path::new(&section.weights);
+        let model = Storm::load(path, &device(&section.device)?).with_context(|| format!("cannot use weights {}", path.display()))?;
+        let name = path.file_name().map_or_else(|| section.weights.clone(), |n| n.to_string_lossy().into_owned());
+        Ok(Self::Loaded { model: Box::new(model), name })
+    }
+
+    /// The architecture.
+    pub fn config(&self) -> &ModelConfig {
+        match self {
+            Self::Loaded { model, .. } => model.config(),
+            Self::Untrained { config, .. } => config,
+        }
+    }
+
+    /// Width and height of the pictures the network takes: the configured ones, else what the weights were made for.
+    pub fn picture_size(&self, section: &ModelConfigSection) -> Result<(usize, usize)> {
+        let config = self.config();
+        let pick = |wanted: usize, own: usize| if wanted == 0 { own } else { wanted };
+        let size = (pick(section.image_width, config.image_width), pick(section.image_height, config.image_height));
+        for (key, x) in [("model.image_width", size.0), ("model.image_height", size.1)] {
+            if x == 0 || x % config.patch_size != 0 {
+                let message = format!("{key} = {x}: wants a multiple of the patch size {}", config.patch_size);
+                return Err(crate::cmd::UsageError(message).into());
+            }
+        }
+        Ok(size)
+    }
+}
+
+fn device(name: &str) -> Result<Device> {
+    let unavailable = |e: candle_core::Error| {
+        crate::cmd::UsageError(format!("model.device = {name}: {e}; this build may lack the feature '{name}', use cpu"))
+    };
+    Ok(match name {
+        "cuda" => Device::new_cuda(0).map_err(unavailable)?,
+        "metal" => Device::new_metal(0).map_err(unavailable)?,
+        _ => Device::Cpu,
+    })
+}
+
+/// The network, the rasteriser and their buffers.
+pub struct Engine {
+    model: Storm,
+    raster: CpuRasterizer,
+    timespan_sec: f64,
+    weights: String,
+}
+
+impl Engine {
+    /// Ready for windows of `cameras` cameras. `timespan_sec` is what the network's clock is divided by.
+    pub fn new(source: ModelSource, section: &ModelConfigSection, cameras: usize, timespan_sec: f64) -> Result<Self> {
+        let (model, weights) = match source {
+            ModelSource::Loaded { model, name } => (*model, name),
+            ModelSource::Untrained { mut config, seed } => {
+                config.num_cams = config.num_cams.max(cameras);
+                (Storm::untrained(&config, seed, &device(&section.device)?)?, UNTRAINED.to_string())
+            }
+        };
+        let config = model.config();
+        let settings = RasterSettings {
+            convention: config.raster_convention(),
+            near: config.near,
+            far: config.far,
+            ..RasterSettings::default()
+        };
+        let raster = CpuRasterizer::new(settings)?;
+        Ok(Self { model, raster, timespan_sec, weights })
+    }
+
+    /// The network's configuration.
+    pub fn model_config(&self) -> &ModelConfig {
+        self.model.config()
+    }
+
+    /// Name of the weights file, or [`UNTRAINED`].
+    pub fn weights(&self) -> &str {
+        &self.weights
+    }
+
+    /// Runs the network on one window: Gaussians in the window's anchor frame, sky and exposure.
+    pub fn step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
+        let pictures: Vec<Vec<Vec<f32>>> =
+            window.steps.iter().map(|set| set.frames.iter().map(|f| network_colors(&f.item.rgb.data)).collect()).collect();
+        let views: Vec<Vec<ViewInput>> = (0..window.steps.len())
+            .map(|t| {
+                let view = |c: usize| ViewInput {
+                    rgb: &pictures[t][c],
+                    intrinsics: cameras[c],
+                    world_from_camera: window.anchor_from_camera(t, c).to_f32(),
+                    time_sec: window.time_sec[t][c] as f32,
+                };
+                (0..cameras.len().min(pictures[t].len())).map(view).collect()
+            })
+            .collect();
+        let batch = ClipBatch::from_views(&views, PixelLayout::Hwc, self.timespan_sec, self.model.device())?;
+        Ok(self.model.forward(&batch)?.scene(0)?)
+    }
+
+    /// Draws a scene: `targets` are camera index (for its exposure) and view in the anchor frame.
+    pub fn render(&mut self, scene: &Scene, targets: &[(View, Option<usize>)], time_sec: f32, want: Want) -> Result<Vec<RenderedView>> {
+        Ok(scene.render(&mut self.raster, targets, time_sec, want)?)
+    }
+}
+
+/// 8-bit colours as the network takes them, -1 to 1.
+fn network_colors(rgb: &[u8]) -> Vec<f32> {
+    rgb.iter().map(|&x| x as f32 / 127.5 - 1.0).collect()
+}
+
+/// The views of a set's cameras in the window's anchor frame, with their exposure's index.
+pub fn views_of(set: &PosedSet<Frame>, map_from_anchor: &Rigid, cameras: &[Intrinsics]) -> Vec<(View, Option<usize>)> {
+    let anchor_from_map = map_from_anchor.inverse();
+    let view = |camera: usize| {
+        let pose = (anchor_from_map * set.frames[camera].map_from_camera).to_f32();
+        (View::from_pose(pose, cameras[camera]), Some(camera))
+    };
+    (0..cameras.len().min(set.frames.len())).map(view).collect()
+}

@@ -1,0 +1,123 @@
+//! `metrics.json`: what a run did, lost, took and scored.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use crate::engine::score::Scores;
+use crate::sync::DropReason;
+
+use super::front::Front;
+use super::step::Finished;
+use super::timing::StageStats;
+
+/// Counts of a run, taken when its stages have ended.
+#[derive(Debug, Clone, Default)]
+pub struct Counts {
+    /// Images that arrived, readable or not.
+    pub images_in: u64,
+    /// Images dropped, by reason.
+    pub dropped: BTreeMap<String, u64>,
+    /// Poses refused.
+    pub poses_rejected: u64,
+    /// Windows whose result was not finite.
+    pub non_finite_windows: u64,
+    /// What could not be read.
+    pub problems: Vec<String>,
+}
+
+impl Counts {
+    /// From the stages' own counters.
+    pub fn new(front: &Front, finished: &Finished, problems: Vec<String>) -> Self {
+        let drops = front.drops();
+        let dropped = DropReason::ALL.iter().map(|&r| (r.as_str().to_string(), drops.get(r))).collect();
+        Self {
+            images_in: front.images_in(),
+            dropped,
+            poses_rejected: front.poses_rejected(),
+            non_finite_windows: finished.non_finite_windows,
+            problems,
+        }
+    }
+}
+
+/// The content of `metrics.json`.
+#[derive(Debug, Clone, Serialize)]
+pub struct Metrics {
+    /// The weights file's name, or `untrained`.
+    pub weights: String,
+    /// The network.
+    pub model: String,
+    /// Images that arrived, over all cameras.
+    pub images_in: u64,
+    /// Synchronized sets with poses (frames of the whole rig).
+    pub frames_in: u64,
+    /// Steps run.
+    pub steps: u64,
+    /// Steps skipped because the scene did not need them.
+    pub steps_skipped: u64,
+    /// Images dropped, by reason; every reason is listed.
+    pub dropped: BTreeMap<String, u64>,
+    /// Poses refused (not finite, not a rotation).
+    pub poses_rejected: u64,
+    /// Windows dropped because the network's result was not finite.
+    pub non_finite_windows: u64,
+    /// Non-finite values published: always 0.
+    pub nonfinite: u64,
+    /// Points withheld from the published clouds because a number in them was not finite.
+    pub withheld: u64,
+    /// What of the input could not be read.
+    pub problems: Vec<String>,
+    /// Milliseconds per stage.
+    pub latency_ms: BTreeMap<String, StageStats>,
+    /// Largest resident memory, MB.
+    pub peak_rss_mb: Option<f64>,
+    /// Wall time of the run, seconds.
+    pub wall_sec: f64,
+    /// Time the recording covers, seconds.
+    pub recorded_sec: f64,
+    /// Gaussians of the last step.
+    pub gaussians: u64,
+    /// Published Gaussians the size limit left out.
+    pub gaussians_left_out: u64,
+    /// Gaussians in the map.
+    pub map_gaussians: u64,
+    /// Map Gaussians given up to the hard cap.
+    pub map_evicted: u64,
+    /// Trajectories written.
+    pub tracks: u64,
+    /// What `map.ply` is relative to, map frame, metres.
+    pub origin_m: [f64; 3],
+    /// Times the clock jumped or the recording looped.
+    pub epochs: u32,
+    /// Error figures on frames that were not context, where there were any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub held_out: Option<Scores>,
+}
+
+impl Metrics {
+    /// True when something of the input was lost.
+    pub fn lost(&self) -> bool {
+        let dropped: u64 = self.dropped.values().sum();
+        dropped + self.poses_rejected + self.non_finite_windows + self.withheld + self.map_evicted > 0
+            || !self.problems.is_empty()
+    }
+
+    /// One line of what was lost, empty when nothing was.
+    pub fn loss_line(&self) -> String {
+        let mut parts: Vec<String> =
+            self.dropped.iter().filter(|(_, n)| **n > 0).map(|(r, n)| format!("{n} images {r}")).collect();
+        for (n, what) in [
+            (self.poses_rejected, "poses refused"),
+            (self.non_finite_windows, "windows not finite"),
+            (self.withheld, "points withheld"),
+            (self.map_evicted, "map Gaussians evicted"),
+        ] {
+            if n > 0 {
+                parts.push(format!("{n} {what}"));
+            }
+        }
+        parts.extend(self.problems.iter().cloned());
+        parts.join("; ")
+    }
+}

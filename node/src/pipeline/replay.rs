@@ -1,0 +1,194 @@
+//! A recorded bag from end to end. The one file with threads and channels: reader (decode) -> step -> writer, joined by
+//! bounded channels that block, so nothing is dropped and the order of results is the order of the recording.
+
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread;
+use std::time::Instant;
+
+use anyhow::{Context, Result, anyhow};
+use crossbeam::channel::{Receiver, Sender, bounded};
+use tracing::{info, warn};
+
+use crate::config::Config;
+use crate::engine::{Engine, ModelSource, UNTRAINED};
+use crate::poses::PoseBuffer;
+use crate::source::bag::BagSource;
+use crate::source::topics::PoseTopic;
+use crate::source::{Event, Rig};
+
+use super::front::{Front, FrontOutput};
+use super::metrics::{Counts, Metrics};
+use super::posed::PoseStore;
+use super::sink::{Sink, SinkInput};
+use super::step::{Finished, StepMaker};
+
+/// Decoded events that may wait for the network; small, since each may hold a picture.
+const EVENTS_AHEAD: usize = 64;
+/// Steps that may wait to be written.
+const STEPS_AHEAD: usize = 4;
+
+/// What to replay, and where the results go.
+pub struct ReplayOptions {
+    /// The bag.
+    pub bag: PathBuf,
+    /// The results folder; made when missing.
+    pub out: PathBuf,
+    /// The configuration.
+    pub config: Config,
+}
+
+/// Called with images read so far and images in all.
+pub type Progress<'a> = &'a (dyn Fn(u64, u64) + Sync);
+
+/// Replays the bag into the results folder.
+pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
+    let start = Instant::now();
+    let config = &options.config;
+    let model = ModelSource::open(&config.model)?;
+    let size = model.picture_size(&config.model)?;
+    let source = BagSource::open(&options.bag, config, size)?;
+    let rig = source.rig();
+    let engine = Engine::new(model, &config.model, rig.cameras.len(), config.window.timespan_sec)?;
+    if engine.weights() == UNTRAINED {
+        warn!("weights: untrained. Seeded random weights stand in; the results show the plumbing, not a reconstruction");
+    }
+    describe(&source, &rig, &engine, size);
+    std::fs::create_dir_all(&options.out)
+        .with_context(|| format!("cannot make results folder {}", options.out.display()))?;
+    let sink = Sink::create(&options.out, &rig, &engine, config)?;
+    let weights = engine.weights().to_string();
+    let preset = engine.model_config().describe();
+
+    let ran = run_stages(&source, engine, sink, config, progress)?;
+    let Ran { front, finished, sink } = ran;
+    let problems = source.problems();
+    problems.iter().for_each(|p| warn!("{p}"));
+    let counts = Counts::new(&front, &finished, problems);
+    let metrics = sink.finish(finished, counts, weights, preset, start.elapsed())?;
+    info!("{} steps in {:.1} s", metrics.steps, metrics.wall_sec);
+    Ok(metrics)
+}
+
+fn describe(source: &BagSource, rig: &Rig, engine: &Engine, (width, height): (usize, usize)) {
+    for (i, c) in rig.cameras.iter().enumerate() {
+        let (w, h) = c.rectifier.source_size();
+        let mark = if i == rig.reference { ", the anchor's" } else { "" };
+        info!("camera {i}: {} ({w}x{h} to {width}x{height}{mark})", c.topic);
+    }
+    let pose = match source.plan().pose {
+        PoseTopic::Message(t) => source.topic_name(t).to_string(),
+        PoseTopic::Tf => "/tf".into(),
+    };
+    info!("pose: {pose} of {}; network: {}", rig.base_frame, engine.model_config().describe());
+}
+
+struct Ran {
+    front: Front,
+    finished: Finished,
+    sink: Sink,
+}
+
+fn run_stages(source: &BagSource, engine: Engine, sink: Sink, config: &Config, progress: Progress) -> Result<Ran> {
+    let rig = source.rig();
+    let (to_step, events) = bounded(EVENTS_AHEAD);
+    let (to_sink, inputs) = bounded(STEPS_AHEAD);
+    thread::scope(|scope| {
+        let total = source.image_count();
+        let reader = scope.spawn(move || read(source, &to_step, total, progress));
+        let writer = scope.spawn(move || write(sink, &inputs));
+        let stepped = step_all(source, &rig, engine, config, &events, &to_sink);
+        // Closing the channels ends the other stages, also when this one failed.
+        drop(events);
+        drop(to_sink);
+        let written = writer.join().map_err(|_| anyhow!("the writer stage panicked"))?;
+        let read = reader.join().map_err(|_| anyhow!("the reader stage panicked"))?;
+        // The writer's error first: when it stops, the others only see a closed channel.
+        let sink = written?;
+        let (front, finished) = stepped?;
+        read?;
+        Ok(Ran { front, finished, sink })
+    })
+}
+
+fn read(source: &BagSource, to_step: &Sender<Event>, total: u64, progress: Progress) -> Result<()> {
+    let mut images = 0;
+    source.events(|event| {
+        let is_image = matches!(event, Event::Image { .. } | Event::Lost { camera: Some(_), .. });
+        images += u64::from(is_image);
+        if is_image {
+            progress(images, total.max(images));
+        }
+        to_step.send(event).is_ok()
+    })
+}
+
+fn step_all(
+    source: &BagSource,
+    rig: &Arc<Rig>,
+    engine: Engine,
+    config: &Config,
+    events: &Receiver<Event>,
+    to_sink: &Sender<SinkInput>,
+) -> Result<(Front, Finished)> {
+    let store = match source.plan().pose {
+        PoseTopic::Message(_) => PoseStore::Buffer(PoseBuffer::new(&config.sync)),
+        PoseTopic::Tf => PoseStore::Tree {
+            tree: source.statics(),
+            fixed: config.input.map_frame.clone(),
+            base: rig.base_frame.clone(),
+        },
+    };
+    let mut front = Front::new(config, rig, store);
+    let mut maker = StepMaker::new(engine, rig.intrinsics(), config);
+    let mut ready = VecDeque::new();
+    for event in events {
+        front.take(event, &mut ready);
+        if !hand_on(&mut ready, &front, &mut maker, to_sink)? {
+            break;
+        }
+    }
+    front.finish(&mut ready);
+    hand_on(&mut ready, &front, &mut maker, to_sink)?;
+    Ok((front, maker.finish()))
+}
+
+/// Runs windows, passes the rest through; false when the writer has gone.
+fn hand_on(
+    ready: &mut VecDeque<FrontOutput>,
+    front: &Front,
+    maker: &mut StepMaker,
+    to_sink: &Sender<SinkInput>,
+) -> Result<bool> {
+    while let Some(output) = ready.pop_front() {
+        let input = match output {
+            FrontOutput::Set(set) => {
+                let vehicle = set.frames.first().map(|f| (f.stamp_ns, front.base_pose(0, &f.map_from_camera)));
+                SinkInput::Set { set, vehicle }
+            }
+            FrontOutput::Truth { camera, stamp_ns, kind, image } => SinkInput::Truth { camera, stamp_ns, kind, image },
+            FrontOutput::Window(window) => match maker.run(window)? {
+                Some(step) => SinkInput::Step(Arc::new(step)),
+                None => continue,
+            },
+        };
+        if to_sink.send(input).is_err() {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+fn write(mut sink: Sink, inputs: &Receiver<SinkInput>) -> Result<Sink> {
+    for input in inputs {
+        sink.take(input)?;
+    }
+    Ok(sink)
+}
+
+/// Where results go when nobody says: `storm_out/<name of the bag>`.
+pub fn default_out(bag: &Path) -> PathBuf {
+    let stem = bag.file_stem().map_or_else(|| "bag".into(), |s| s.to_string_lossy().into_owned());
+    Path::new("storm_out").join(stem)
+}

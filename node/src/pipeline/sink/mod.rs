@@ -1,0 +1,205 @@
+//! What a replay leaves behind: takes sets, steps and ground truth in order, writes the results folder.
+
+mod gallery;
+mod topics;
+
+pub use topics::{ANCHOR_FRAME, ORIGIN_FRAME, Publisher, motion_mask, surface_depth};
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+
+use crate::config::Config;
+use crate::engine::Engine;
+use crate::engine::score::Scorer;
+use crate::output::ply::{PlyCloud, write_ply};
+use crate::output::tracks_csv::{TrackRow, write_tracks_csv};
+use crate::output::tum::write_tum;
+use crate::rigid::Rigid;
+use crate::source::topics::TruthKind;
+use crate::source::{Frame, Rig};
+use crate::window::PosedSet;
+
+use super::front::TruthImage;
+use super::metrics::{Counts, Metrics};
+use super::step::{Finished, Step};
+use super::timing::{Timings, peak_rss_mb};
+use gallery::Gallery;
+
+/// One thing to write.
+pub enum SinkInput {
+    /// A synchronized, posed set.
+    Set {
+        /// The set.
+        set: Arc<PosedSet<Frame>>,
+        /// Stamp and vehicle pose at its first camera's image.
+        vehicle: Option<(i64, Rigid)>,
+    },
+    /// Ground truth of a camera at a stamp.
+    Truth {
+        /// Which camera.
+        camera: usize,
+        /// Stamp, nanoseconds.
+        stamp_ns: i64,
+        /// What it holds.
+        kind: TruthKind,
+        /// The image.
+        image: TruthImage,
+    },
+    /// A step's result.
+    Step(Arc<Step>),
+}
+
+/// The writer's state over a run.
+pub struct Sink {
+    out: PathBuf,
+    rig: Arc<Rig>,
+    config: Config,
+    publisher: Option<Publisher>,
+    scorer: Option<Scorer>,
+    gallery: Gallery,
+    poses: Vec<(i64, Rigid)>,
+    sets: u64,
+    last_gaussians: u64,
+    epochs: u32,
+    timings: Timings,
+}
+
+impl Sink {
+    /// Starts the results folder `out` (which is there).
+    pub fn create(out: &Path, rig: &Arc<Rig>, engine: &Engine, config: &Config) -> Result<Self> {
+        let publisher = match config.output.bag {
+            true => Some(Publisher::create(&out.join("outputs.mcap"), rig.cameras.len())?),
+            false => None,
+        };
+        let scorer = match config.output.score_held_out {
+            true => Some(Scorer::new(engine.raster_settings(), rig.clone(), config.output.score_frames_per_step)?),
+            false => None,
+        };
+        Ok(Self {
+            out: out.to_path_buf(),
+            rig: rig.clone(),
+            config: config.clone(),
+            publisher,
+            scorer,
+            gallery: Gallery::new(config.output.report_steps),
+            poses: Vec::new(),
+            sets: 0,
+            last_gaussians: 0,
+            epochs: 0,
+            timings: Timings::default(),
+        })
+    }
+
+    /// Takes the next thing.
+    pub fn take(&mut self, input: SinkInput) -> Result<()> {
+        match input {
+            SinkInput::Set { set, vehicle } => {
+                self.sets += 1;
+                self.epochs = self.epochs.max(set.epoch);
+                self.poses.extend(vehicle);
+                if let Some(scorer) = &mut self.scorer {
+                    scorer.set(set);
+                }
+            }
+            SinkInput::Truth { camera, stamp_ns, kind, image } => {
+                if let Some(scorer) = &mut self.scorer {
+                    scorer.truth(camera, stamp_ns, kind, image);
+                }
+            }
+            SinkInput::Step(step) => {
+                self.last_gaussians = step.scene.gaussians.len() as u64;
+                if let Some(publisher) = &mut self.publisher {
+                    let (rig, config) = (&self.rig, &self.config);
+                    self.timings.time("publish", || publisher.step(&step, rig, config))?;
+                }
+                self.gallery.offer(&step);
+                if let Some(scorer) = &mut self.scorer {
+                    self.timings.time("score", || scorer.step(step))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes what is written once, at the end.
+    pub fn finish(
+        self,
+        finished: Finished,
+        counts: Counts,
+        weights: String,
+        model: String,
+        wall: Duration,
+    ) -> Result<Metrics> {
+        let Self { out, config, publisher, scorer, gallery, poses, .. } = self;
+        let place = |name: &str| out.join(name);
+        let origin = finished.map.origin();
+        let cloud: PlyCloud = finished.map.cloud();
+        let notes = [
+            format!("storm {}; weights: {weights}; model: {model}", env!("CARGO_PKG_VERSION")),
+            "static map without the sky; positions in metres, relative to origin_m in the map frame".to_string(),
+        ];
+        write_ply(&place("map.ply"), &cloud, origin.to_array(), &notes)?;
+        let rows: Vec<TrackRow> = finished.tracks.iter().flat_map(track_rows).collect();
+        write_tracks_csv(&place("tracks.csv"), &rows)?;
+        write_tum(&place("trajectory.tum"), poses.iter().copied())?;
+        std::fs::write(place("config.yaml"), config.to_yaml()).context("cannot write config.yaml")?;
+        let (mut withheld, mut left_out) = (0, 0);
+        if let Some(publisher) = publisher {
+            left_out = publisher.truncated;
+            withheld = publisher.finish(&cloud, origin, &poses, &config)?;
+        }
+        let mut timings = finished.timings;
+        timings.merge(self.timings);
+        let held_out = match scorer {
+            Some(scorer) => scorer.finish()?,
+            None => None,
+        };
+        let recorded_ns = match (poses.first(), poses.last()) {
+            (Some(first), Some(last)) => last.0.saturating_sub(first.0),
+            _ => 0,
+        };
+        let metrics = Metrics {
+            weights,
+            model,
+            images_in: counts.images_in,
+            frames_in: self.sets,
+            steps: finished.steps,
+            steps_skipped: 0,
+            dropped: counts.dropped,
+            poses_rejected: counts.poses_rejected,
+            non_finite_windows: counts.non_finite_windows,
+            nonfinite: 0,
+            withheld,
+            problems: counts.problems,
+            latency_ms: timings.stats(),
+            peak_rss_mb: peak_rss_mb(),
+            wall_sec: wall.as_secs_f64(),
+            recorded_sec: recorded_ns as f64 * 1e-9,
+            gaussians: self.last_gaussians,
+            gaussians_left_out: left_out,
+            map_gaussians: cloud.len() as u64,
+            map_evicted: finished.map.evicted(),
+            tracks: finished.tracks.len() as u64,
+            origin_m: origin.to_array(),
+            epochs: self.epochs,
+            held_out,
+        };
+        let json = serde_json::to_string_pretty(&metrics).context("metrics.json")?;
+        std::fs::write(place("metrics.json"), json + "\n").context("cannot write metrics.json")?;
+        gallery.write(&place("report.html"), &self.rig, &metrics, &cloud, origin, &rows, &poses, &config)?;
+        Ok(metrics)
+    }
+}
+
+fn track_rows(track: &crate::tracks::Track) -> impl Iterator<Item = TrackRow> + '_ {
+    track.points.iter().map(|p| TrackRow {
+        track_id: track.id,
+        stamp_ns: p.stamp_ns,
+        position_m: p.position_map.to_array(),
+        velocity_mps: p.velocity_map_mps.to_array(),
+        motion_id: p.motion_id,
+    })
+}

@@ -1,0 +1,95 @@
+//! Gaussians read back from a results folder: the map, or one step.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use glam::{DQuat, DVec3};
+
+use crate::bag::Bag;
+use crate::cdr::decode as cdr;
+use crate::msg::PointCloud2;
+use crate::output::ply::{PlyCloud, read_ply};
+use crate::pipeline::sink::{ANCHOR_FRAME, PREFIX};
+use crate::rigid::Rigid;
+
+/// Gaussians in a local frame, and where that frame lies.
+pub struct SavedGaussians {
+    /// The Gaussians.
+    pub cloud: PlyCloud,
+    /// Their velocities, m/s; empty for a map.
+    pub velocities: Vec<[f32; 3]>,
+    /// The local frame in the map frame.
+    pub map_from_local: Rigid,
+}
+
+/// Reads `map.ply`.
+pub fn load_ply(path: &Path) -> Result<SavedGaussians> {
+    let file = read_ply(path)?;
+    let map_from_local = Rigid::new(DQuat::IDENTITY, DVec3::from_array(file.origin_m));
+    Ok(SavedGaussians { cloud: file.cloud, velocities: Vec::new(), map_from_local })
+}
+
+/// Reads one step's Gaussians from `outputs.mcap`; the last step when `step` is not given.
+pub fn load_step(path: &Path, step: Option<usize>) -> Result<SavedGaussians> {
+    let bag = Bag::open(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let name = format!("{PREFIX}/gaussians");
+    let find = |name: &str| bag.topics().iter().position(|t| t.name == name);
+    let Some(topic) = find(&name) else { bail!("{} has no topic {name}", path.display()) };
+    let count = bag.topics()[topic].count as usize;
+    let wanted = step.unwrap_or(count.saturating_sub(1));
+    if wanted >= count {
+        bail!("{} has {count} steps, numbered from 0; there is no step {wanted}", path.display());
+    }
+    let message = bag.messages(&[topic])?.nth(wanted).context("the bag ended before that step")??;
+    let cloud = cdr::point_cloud2(&message.data)?;
+    let map_from_local = match find("/tf") {
+        Some(tf) => anchor_at(&bag, tf, cloud.header.stamp_ns)?,
+        None => bail!("{} has no /tf, so nobody knows where {ANCHOR_FRAME} was", path.display()),
+    };
+    let (gaussians, velocities) = columns(&cloud)?;
+    Ok(SavedGaussians { cloud: gaussians, velocities, map_from_local })
+}
+
+fn anchor_at(bag: &Bag, tf: usize, stamp_ns: i64) -> Result<Rigid> {
+    for message in bag.messages(&[tf])? {
+        for t in cdr::tf_message(&message?.data)? {
+            if t.child_frame_id == ANCHOR_FRAME && t.header.stamp_ns == stamp_ns {
+                return t.transform.normalized().context("the anchor's transform is not a rotation");
+            }
+        }
+    }
+    bail!("no transform of {ANCHOR_FRAME} at {stamp_ns} ns")
+}
+
+/// The float columns of a Gaussian cloud by name.
+fn columns(cloud: &PointCloud2) -> Result<(PlyCloud, Vec<[f32; 3]>)> {
+    let n = cloud.width as usize * cloud.height as usize;
+    let step = cloud.point_step as usize;
+    if step == 0 || cloud.data.len() < n.saturating_mul(step) {
+        bail!("cloud of {n} points of {step} bytes has {} bytes", cloud.data.len());
+    }
+    let offset = |name: &str| -> Result<usize> {
+        let field = cloud.fields.iter().find(|f| f.name == name && f.datatype == 7);
+        let field = field.with_context(|| format!("cloud has no float column {name}"))?;
+        let end = field.offset as usize + 4;
+        if end <= step { Ok(field.offset as usize) } else { bail!("column {name} ends at byte {end} of {step}") }
+    };
+    let at = |point: &[u8], o: usize| f32::from_le_bytes([point[o], point[o + 1], point[o + 2], point[o + 3]]);
+    let mut offsets = Vec::new();
+    let names = "x y z rgb vx vy vz opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
+    for name in names.split(' ') {
+        offsets.push(offset(name)?);
+    }
+    let (mut out, mut velocities) = (PlyCloud::default(), Vec::with_capacity(n));
+    for point in cloud.data.chunks_exact(step).take(n) {
+        let v: Vec<f32> = offsets.iter().map(|&o| at(point, o)).collect();
+        let bytes = v[3].to_bits().to_le_bytes();
+        out.positions.push([v[0], v[1], v[2]]);
+        out.colors01.push([bytes[2], bytes[1], bytes[0]].map(|b| b as f32 / 255.0));
+        velocities.push([v[4], v[5], v[6]]);
+        out.opacities.push(v[7]);
+        out.scales.push([v[8], v[9], v[10]]);
+        out.quats.push([v[11], v[12], v[13], v[14]]);
+    }
+    Ok((out, velocities))
+}

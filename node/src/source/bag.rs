@@ -1,0 +1,278 @@
+//! A recorded bag as a stream of events.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use tracing::warn;
+
+use crate::bag::{Bag, RawMessage};
+use crate::cdr::decode as cdr;
+use crate::config::{Config, SyncConfig};
+use crate::decode::{self, RgbPicture};
+use crate::msg::{CameraInfo, TransformStamped};
+use crate::sync::DropReason;
+use crate::tf::TfTree;
+
+use super::event::{Event, Frame, Truth};
+use super::rig::{CameraDescription, Rig};
+use super::topics::{PoseTopic, TopicPlan, TruthKind};
+
+/// Losses of one topic that are written to the log one by one; the rest is only counted.
+const LOGGED_LOSSES_PER_TOPIC: usize = 5;
+
+/// What a topic's messages are turned into.
+#[derive(Debug, Clone, Copy)]
+enum Role {
+    Image { camera: usize, compressed: bool },
+    Pose,
+    Transform,
+    Truth { camera: usize, kind: TruthKind },
+    None,
+}
+
+/// An opened bag with its topics and cameras resolved.
+pub struct BagSource {
+    bag: Bag,
+    plan: TopicPlan,
+    rig: Arc<Rig>,
+    sync: SyncConfig,
+    static_transforms: Vec<TransformStamped>,
+    roles: Vec<Role>,
+}
+
+impl BagSource {
+    /// Opens a bag, finds its topics and reads ahead for what describes the cameras (CameraInfo, /tf_static and each
+    /// camera's first image). `network_size` is width and height of the pictures the network takes.
+    pub fn open(path: &Path, config: &Config, network_size: (usize, usize)) -> Result<Self> {
+        let bag = Bag::open(path).with_context(|| format!("cannot read bag {}", path.display()))?;
+        if bag.message_count() == 0 {
+            anyhow::bail!("bag {} holds no messages", path.display());
+        }
+        let plan = TopicPlan::resolve(bag.topics(), &config.input).with_context(|| format!("bag {}", path.display()))?;
+        let (described, pose_child, static_transforms) = describe(&bag, &plan)?;
+        let rig = Rig::build(described, &static_tree(&config.sync, &static_transforms), &pose_child, &config.input, network_size)
+            .with_context(|| format!("bag {}", path.display()))?;
+        let mut roles = vec![Role::None; bag.topics().len()];
+        for (camera, c) in plan.cameras.iter().enumerate() {
+            roles[c.image] = Role::Image { camera, compressed: c.compressed };
+        }
+        for &(camera, kind, topic) in &plan.truth {
+            roles[topic] = Role::Truth { camera, kind };
+        }
+        match plan.pose {
+            PoseTopic::Message(topic) => roles[topic] = Role::Pose,
+            PoseTopic::Tf => plan.tf.iter().for_each(|&t| roles[t] = Role::Transform),
+        }
+        Ok(Self { bag, plan, rig: Arc::new(rig), sync: config.sync.clone(), static_transforms, roles })
+    }
+
+    /// The cameras.
+    pub fn rig(&self) -> Arc<Rig> {
+        self.rig.clone()
+    }
+
+    /// The topics by part.
+    pub fn plan(&self) -> &TopicPlan {
+        &self.plan
+    }
+
+    /// The static transforms, for a pose that comes from TF.
+    pub fn statics(&self) -> TfTree {
+        static_tree(&self.sync, &self.static_transforms)
+    }
+
+    /// Name of topic number `topic` of the plan.
+    pub fn topic_name(&self, topic: usize) -> &str {
+        self.bag.topics().get(topic).map_or("?", |t| t.name.as_str())
+    }
+
+    /// Messages on the camera topics (what a progress bar counts).
+    pub fn image_count(&self) -> u64 {
+        self.plan.cameras.iter().map(|c| self.bag.topics()[c.image].count).sum()
+    }
+
+    /// What could not be read without stopping the run; complete once all events were taken.
+    pub fn problems(&self) -> Vec<String> {
+        self.bag.problems()
+    }
+
+    /// Runs through the bag once, in log-time order. `each` returns false to stop early.
+    pub fn events(&self, mut each: impl FnMut(Event) -> bool) -> Result<()> {
+        let wanted: Vec<usize> =
+            (0..self.roles.len()).filter(|&i| !matches!(self.roles[i], Role::None)).collect();
+        let mut losses = vec![0usize; self.roles.len()];
+        for message in self.bag.messages(&wanted)? {
+            let message = match message {
+                Ok(m) => m,
+                Err(e) => {
+                    warn!("{e}");
+                    if !each(Event::Lost { camera: None, reason: DropReason::Decode, detail: e.to_string() }) {
+                        return Ok(());
+                    }
+                    continue;
+                }
+            };
+            let role = self.roles.get(message.topic).copied().unwrap_or(Role::None);
+            let mut go_on = true;
+            self.translate(role, &message, &mut |event| {
+                if let Event::Lost { detail, .. } = &event {
+                    losses[message.topic] += 1;
+                    if losses[message.topic] <= LOGGED_LOSSES_PER_TOPIC {
+                        warn!("{detail}");
+                    }
+                }
+                go_on = go_on && each(event);
+            });
+            if !go_on {
+                return Ok(());
+            }
+        }
+        Ok(())
+    }
+
+    /// Turns one message into events.
+    fn translate(&self, role: Role, message: &RawMessage, each: &mut dyn FnMut(Event)) {
+        let topic = self.bag.topics().get(message.topic).map_or("?", |t| t.name.as_str());
+        let lost = |camera: Option<usize>, stamp_ns: i64, why: String| Event::Lost {
+            camera,
+            reason: DropReason::Decode,
+            detail: format!("{topic} at {stamp_ns} ns: {why}"),
+        };
+        match role {
+            Role::Image { camera, compressed } => match self.picture(camera, compressed, &message.data) {
+                Ok((stamp_ns, rgb)) => {
+                    each(Event::Image { camera, stamp_ns, frame: Frame { rgb: Arc::new(rgb) } });
+                }
+                Err(e) => each(lost(Some(camera), stamp_of(message), format!("{e:#}"))),
+            },
+            Role::Pose => {
+                let type_name = self.bag.topics().get(message.topic).map_or("", |t| t.type_name.as_str());
+                match cdr::pose(type_name, &message.data) {
+                    Ok(p) => each(Event::Pose { stamp_ns: p.header.stamp_ns, map_from_base: p.pose }),
+                    Err(e) => each(lost(None, stamp_of(message), e.to_string())),
+                }
+            }
+            Role::Transform => match cdr::tf_message(&message.data) {
+                Ok(list) => list.into_iter().for_each(|t| each(Event::Transform(Box::new(t)))),
+                Err(e) => each(lost(None, stamp_of(message), e.to_string())),
+            },
+            Role::Truth { camera, kind } => match truth(kind, &message.data) {
+                Ok(event) => each(event.of(camera, kind)),
+                Err(e) => each(lost(None, stamp_of(message), format!("{e:#}"))),
+            },
+            Role::None => {}
+        }
+    }
+
+    fn picture(&self, camera: usize, compressed: bool, data: &[u8]) -> Result<(i64, RgbPicture)> {
+        let (stamp_ns, full) = if compressed {
+            let image = cdr::compressed_image(data)?;
+            (image.header.stamp_ns, decode::compressed_to_rgb(&image)?)
+        } else {
+            let image = cdr::image(data)?;
+            (image.header.stamp_ns, decode::image_to_rgb(&image)?)
+        };
+        Ok((stamp_ns, self.rig.cameras[camera].rectifier.apply(&full)?))
+    }
+}
+
+/// The header stamp when it can be read, else the log time: for messages about messages.
+fn stamp_of(message: &RawMessage) -> i64 {
+    cdr::header(&message.data).map_or(message.log_time_ns, |h| h.stamp_ns)
+}
+
+fn static_tree(sync: &SyncConfig, transforms: &[TransformStamped]) -> TfTree {
+    let mut tree = TfTree::new(sync);
+    for t in transforms {
+        if let Err(e) = tree.insert(t, true) {
+            warn!("/tf_static: {e}");
+        }
+    }
+    tree
+}
+
+struct TruthImage {
+    stamp_ns: i64,
+    width: usize,
+    height: usize,
+    data: Truth,
+}
+
+impl TruthImage {
+    fn of(self, camera: usize, kind: TruthKind) -> Event {
+        let Self { stamp_ns, width, height, data } = self;
+        Event::Truth { camera, stamp_ns, kind, width, height, data: Arc::new(data) }
+    }
+}
+
+fn truth(kind: TruthKind, data: &[u8]) -> Result<TruthImage> {
+    let image = cdr::image(data)?;
+    let (width, height) = (image.width as usize, image.height as usize);
+    let data = match kind {
+        TruthKind::Depth => Truth::Depth(decode::image_to_depth(&image)?.data),
+        TruthKind::Flow => Truth::Flow(decode::image_to_vectors(&image)?),
+        TruthKind::Moving | TruthKind::Sky => Truth::Mask(decode::image_to_labels(&image)?),
+    };
+    Ok(TruthImage { stamp_ns: image.header.stamp_ns, width, height, data })
+}
+
+/// Reads ahead until every camera is described: CameraInfo, first image's frame, /tf_static, the pose's child frame.
+fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, String, Vec<TransformStamped>)> {
+    let mut statics = Vec::new();
+    let n = plan.cameras.len();
+    let mut infos: Vec<Option<CameraInfo>> = vec![None; n];
+    let mut frames: Vec<Option<String>> = vec![None; n];
+    let mut pose_child: Option<String> = None;
+    let pose_topic = match plan.pose {
+        PoseTopic::Message(t) => Some(t),
+        PoseTopic::Tf => None,
+    };
+    let mut wanted: Vec<usize> = plan.tf_static.clone();
+    wanted.extend(pose_topic);
+    wanted.extend(plan.cameras.iter().flat_map(|c| [c.image, c.info]));
+    wanted.sort_unstable();
+    wanted.dedup();
+    let mut statics_left: u64 = plan.tf_static.iter().map(|&t| bag.topics()[t].count).sum();
+    for message in bag.messages(&wanted)? {
+        let Ok(m) = message else { continue };
+        if plan.tf_static.contains(&m.topic) {
+            statics_left = statics_left.saturating_sub(1);
+            match cdr::tf_message(&m.data) {
+                Ok(list) => statics.extend(list),
+                Err(e) => warn!("/tf_static: {e}"),
+            }
+        }
+        if pose_topic == Some(m.topic) && pose_child.is_none() {
+            pose_child = cdr::pose(&bag.topics()[m.topic].type_name, &m.data).ok().map(|p| p.child_frame_id);
+        }
+        for (i, c) in plan.cameras.iter().enumerate() {
+            if c.info == m.topic && infos[i].is_none() {
+                match cdr::camera_info(&m.data) {
+                    Ok(info) => infos[i] = Some(info),
+                    Err(e) => warn!("{}: {e}", bag.topics()[m.topic].name),
+                }
+            }
+            if c.image == m.topic && frames[i].is_none() {
+                frames[i] = cdr::header(&m.data).ok().map(|h| h.frame_id);
+            }
+        }
+        let described = infos.iter().all(Option::is_some) && frames.iter().all(Option::is_some);
+        if described && statics_left == 0 && (pose_topic.is_none() || pose_child.is_some()) {
+            break;
+        }
+    }
+    let described = plan
+        .cameras
+        .iter()
+        .zip(infos)
+        .zip(frames)
+        .map(|((c, info), frame_id)| CameraDescription {
+            topic: c.name.clone(),
+            info_topic: bag.topics()[c.info].name.clone(),
+            frame_id,
+            info,
+        })
+        .collect();
+    Ok((described, pose_child.unwrap_or_default(), statics))
+}

@@ -1,0 +1,12 @@
+//! Where images and poses come from. A source turns its own kind of message into [`Event`]s and nothing more; live
+//! topics and recorded bags give the same events, so everything behind them is one program.
+
+pub mod bag;
+pub mod event;
+pub mod rig;
+pub mod topics;
+pub mod world;
+
+pub use event::{Event, Frame, Truth};
+pub use rig::{Rig, RigError};
+pub use topics::{TopicError, TopicPlan};

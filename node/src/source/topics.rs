@@ -1,0 +1,363 @@
+//! Which topics of a recording play which part: by configuration, or found by type.
+
+use serde::Serialize;
+use thiserror::Error;
+
+use crate::bag::Topic;
+use crate::config::InputConfig;
+
+/// Most cameras the network takes.
+pub const MAX_CAMERAS: usize = 6;
+
+const IMAGE: &str = "sensor_msgs/msg/Image";
+const COMPRESSED: &str = "sensor_msgs/msg/CompressedImage";
+const CAMERA_INFO: &str = "sensor_msgs/msg/CameraInfo";
+const TF: &str = "tf2_msgs/msg/TFMessage";
+/// Message types a vehicle pose comes in.
+pub const POSE_TYPES: [&str; 4] = [
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+];
+/// Parts of topic names that say an image is not a camera picture.
+const NOT_A_PICTURE: [&str; 6] = ["depth", "mask", "disparity", "label", "confidence", "semantic"];
+
+/// Why the topics of a recording cannot be matched to their parts. The message lists what was found and names the fix.
+#[derive(Debug, Error)]
+pub enum TopicError {
+    /// A topic named by the configuration is not in the recording.
+    #[error("{key} names topic {topic}, which the recording does not have; it has: {found}")]
+    Missing {
+        /// The configuration key.
+        key: &'static str,
+        /// The name.
+        topic: String,
+        /// Topics of a fitting type.
+        found: String,
+    },
+    /// A topic named by the configuration has another type.
+    #[error("{key} names topic {topic} of type {found}; wanted {wanted}")]
+    Type {
+        /// The configuration key.
+        key: &'static str,
+        /// The name.
+        topic: String,
+        /// Its type.
+        found: String,
+        /// What would fit.
+        wanted: String,
+    },
+    /// No topic plays this part.
+    #[error("no {part} in the recording; its topics: {found}")]
+    None {
+        /// What was looked for.
+        part: &'static str,
+        /// All topics with their types.
+        found: String,
+    },
+    /// More than one topic could play this part.
+    #[error("{part} is ambiguous, name it with {key}; candidates: {candidates}")]
+    Ambiguous {
+        /// What was looked for.
+        part: String,
+        /// The configuration key that settles it.
+        key: &'static str,
+        /// The candidates.
+        candidates: String,
+    },
+}
+
+/// One camera's topics, as indices into the recording's topic list.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CameraTopics {
+    /// Image topic.
+    pub image: usize,
+    /// Its name.
+    pub name: String,
+    /// True for CompressedImage.
+    pub compressed: bool,
+    /// CameraInfo topic.
+    pub info: usize,
+}
+
+/// Where the vehicle pose comes from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub enum PoseTopic {
+    /// A topic of one of the pose types.
+    Message(usize),
+    /// The transform tree.
+    Tf,
+}
+
+/// What a ground-truth topic holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub enum TruthKind {
+    /// z-depth, metres, 0 for sky.
+    Depth,
+    /// Scene flow, m/s in map axes.
+    Flow,
+    /// Not 0 where the surface moves.
+    Moving,
+    /// Not 0 where the ray meets the sky.
+    Sky,
+}
+
+/// The recording's topics by part.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TopicPlan {
+    /// Cameras, in the network's order.
+    pub cameras: Vec<CameraTopics>,
+    /// The vehicle pose.
+    pub pose: PoseTopic,
+    /// `/tf` topics.
+    pub tf: Vec<usize>,
+    /// `/tf_static` topics.
+    pub tf_static: Vec<usize>,
+    /// Ground truth: camera, kind, topic.
+    pub truth: Vec<(usize, TruthKind, usize)>,
+}
+
+impl TopicPlan {
+    /// Matches `topics` to their parts.
+    pub fn resolve(topics: &[Topic], config: &InputConfig) -> Result<Self, TopicError> {
+        let images = if config.images.is_empty() {
+            find_images(topics, config)?
+        } else {
+            let by_name = |name: &String| named(topics, "input.images", name, &[IMAGE, COMPRESSED]);
+            config.images.iter().map(by_name).collect::<Result<_, _>>()?
+        };
+        let mut cameras = Vec::new();
+        for (i, &image) in images.iter().enumerate() {
+            let name = topics[image].name.clone();
+            let info = match config.camera_infos.get(i) {
+                Some(info) => named(topics, "input.camera_infos", info, &[CAMERA_INFO])?,
+                None => find_info(topics, &name)?,
+            };
+            cameras.push(CameraTopics { image, compressed: topics[image].type_name == COMPRESSED, name, info });
+        }
+        let of_tf = |is_static: bool| {
+            let fits = |t: &Topic| t.type_name == TF && t.name.ends_with("tf_static") == is_static;
+            (0..topics.len()).filter(|&i| fits(&topics[i])).collect::<Vec<_>>()
+        };
+        let (tf, tf_static) = (of_tf(false), of_tf(true));
+        let pose = find_pose(topics, config, !tf.is_empty())?;
+        let truth = find_truth(topics, config, &cameras);
+        Ok(Self { cameras, pose, tf, tf_static, truth })
+    }
+}
+
+fn is_truth(topic: &Topic, config: &InputConfig) -> bool {
+    !config.truth_prefix.is_empty() && topic.name.starts_with(&config.truth_prefix)
+}
+
+fn list<'a>(topics: impl Iterator<Item = &'a Topic>) -> String {
+    let names: Vec<String> = topics.map(|t| format!("{} ({})", t.name, t.type_name)).collect();
+    if names.is_empty() { "none".into() } else { names.join(", ") }
+}
+
+fn named(topics: &[Topic], key: &'static str, name: &str, types: &[&str]) -> Result<usize, TopicError> {
+    let Some(i) = topics.iter().position(|t| t.name == name) else {
+        let found = list(topics.iter().filter(|t| types.contains(&t.type_name.as_str())));
+        return Err(TopicError::Missing { key, topic: name.into(), found });
+    };
+    if types.contains(&topics[i].type_name.as_str()) {
+        return Ok(i);
+    }
+    Err(TopicError::Type { key, topic: name.into(), found: topics[i].type_name.clone(), wanted: types.join(" or ") })
+}
+
+/// The topic without the transport suffix: `/a/image_rect/compressed` and `/a/image_rect` are one picture.
+fn picture_name(name: &str) -> &str {
+    name.strip_suffix("/compressed").unwrap_or(name)
+}
+
+fn parent(name: &str) -> &str {
+    name.rsplit_once('/').map_or("", |(p, _)| p)
+}
+
+fn find_images(topics: &[Topic], config: &InputConfig) -> Result<Vec<usize>, TopicError> {
+    let picture = |t: &Topic| {
+        let last = picture_name(&t.name).rsplit('/').next().unwrap_or("");
+        let kind = t.type_name == IMAGE || t.type_name == COMPRESSED;
+        kind && t.count > 0 && !is_truth(t, config) && !NOT_A_PICTURE.iter().any(|w| last.contains(w))
+    };
+    let mut found: Vec<usize> = (0..topics.len()).filter(|&i| picture(&topics[i])).collect();
+    // Of a raw topic and its compressed twin the raw one is used: nothing lost, nothing to decode.
+    let raw: Vec<String> =
+        found.iter().filter(|&&i| topics[i].type_name == IMAGE).map(|&i| topics[i].name.clone()).collect();
+    found.retain(|&i| topics[i].type_name == IMAGE || !raw.iter().any(|r| r == picture_name(&topics[i].name)));
+    if found.is_empty() {
+        return Err(TopicError::None { part: "camera image topic", found: list(topics.iter()) });
+    }
+    found.sort_by(|&a, &b| natural(&topics[a].name).cmp(&natural(&topics[b].name)));
+    let twins = found.windows(2).any(|w| {
+        let dir = |i: usize| parent(picture_name(&topics[i].name)).to_string();
+        !dir(w[0]).is_empty() && dir(w[0]) == dir(w[1]) && shares_info(topics, &dir(w[0]))
+    });
+    if twins || found.len() > MAX_CAMERAS {
+        let why = if twins { "two pictures of one camera" } else { "more than 6 image topics" };
+        return Err(TopicError::Ambiguous {
+            part: format!("the set of cameras ({why})"),
+            key: "input.images",
+            candidates: list(found.iter().map(|&i| &topics[i])),
+        });
+    }
+    Ok(found)
+}
+
+/// True when `dir` holds one CameraInfo for all its images, so that several images there are of one camera.
+fn shares_info(topics: &[Topic], dir: &str) -> bool {
+    topics.iter().any(|t| t.type_name == CAMERA_INFO && parent(&t.name) == dir)
+}
+
+/// Splits a name into text and numbers, so that camera10 sorts after camera9.
+pub fn natural(name: &str) -> Vec<(String, u64)> {
+    let mut parts = Vec::new();
+    let (mut text, mut digits) = (String::new(), String::new());
+    for c in name.chars() {
+        if c.is_ascii_digit() {
+            digits.push(c);
+            continue;
+        }
+        if !digits.is_empty() {
+            parts.push((std::mem::take(&mut text), std::mem::take(&mut digits).parse().unwrap_or(u64::MAX)));
+        }
+        text.push(c);
+    }
+    parts.push((text, digits.parse().unwrap_or(0)));
+    parts
+}
+
+fn find_info(topics: &[Topic], image: &str) -> Result<usize, TopicError> {
+    let infos: Vec<usize> = (0..topics.len()).filter(|&i| topics[i].type_name == CAMERA_INFO).collect();
+    let base = picture_name(image);
+    // image_transport's rule first (beside the image), then below the image (`<image>/camera_info`).
+    for wanted in [format!("{}/camera_info", parent(base)), format!("{base}/camera_info")] {
+        if let Some(&i) = infos.iter().find(|&&i| topics[i].name == wanted) {
+            return Ok(i);
+        }
+    }
+    if infos.is_empty() {
+        return Err(TopicError::None { part: "camera_info topic", found: list(topics.iter()) });
+    }
+    Err(TopicError::Ambiguous {
+        part: format!("the camera_info of {image}"),
+        key: "input.camera_infos",
+        candidates: list(infos.iter().map(|&i| &topics[i])),
+    })
+}
+
+fn find_pose(topics: &[Topic], config: &InputConfig, has_tf: bool) -> Result<PoseTopic, TopicError> {
+    if !config.pose.is_empty() {
+        let mut types = POSE_TYPES.to_vec();
+        types.push(TF);
+        let i = named(topics, "input.pose", &config.pose, &types)?;
+        return Ok(if topics[i].type_name == TF { PoseTopic::Tf } else { PoseTopic::Message(i) });
+    }
+    let fits = |t: &Topic| POSE_TYPES.contains(&t.type_name.as_str()) && t.count > 0 && !is_truth(t, config);
+    let found: Vec<usize> = (0..topics.len()).filter(|&i| fits(&topics[i])).collect();
+    match found.as_slice() {
+        [one] => Ok(PoseTopic::Message(*one)),
+        [] if has_tf => Ok(PoseTopic::Tf),
+        [] => Err(TopicError::None { part: "vehicle pose topic", found: list(topics.iter()) }),
+        many => Err(TopicError::Ambiguous {
+            part: "the vehicle pose".into(),
+            key: "input.pose",
+            candidates: list(many.iter().map(|&i| &topics[i])),
+        }),
+    }
+}
+
+/// Ground truth of camera i is below `<prefix>/<the camera's own namespace>/{depth,flow,moving,sky}`.
+fn find_truth(topics: &[Topic], config: &InputConfig, cameras: &[CameraTopics]) -> Vec<(usize, TruthKind, usize)> {
+    let mut truth = Vec::new();
+    for (camera, c) in cameras.iter().enumerate() {
+        let dir = parent(picture_name(&c.name));
+        let kinds = [
+            (TruthKind::Depth, "depth"),
+            (TruthKind::Flow, "flow"),
+            (TruthKind::Moving, "moving"),
+            (TruthKind::Sky, "sky"),
+        ];
+        for (kind, last) in kinds {
+            let name = format!("{}{dir}/{last}", config.truth_prefix);
+            let found = topics.iter().position(|t| t.name == name && t.type_name == IMAGE);
+            truth.extend(found.map(|topic| (camera, kind, topic)));
+        }
+    }
+    truth
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topic(name: &str, type_name: &str) -> Topic {
+        Topic { name: name.into(), type_name: type_name.into(), serialization: "cdr".into(), count: 5 }
+    }
+
+    fn stereo() -> Vec<Topic> {
+        vec![
+            topic("/camera/right/image_rect/compressed", COMPRESSED),
+            topic("/camera/left/image_rect/compressed", COMPRESSED),
+            topic("/camera/left/camera_info", CAMERA_INFO),
+            topic("/camera/right/camera_info", CAMERA_INFO),
+            topic("/odometry", POSE_TYPES[0]),
+            topic("/tf_static", TF),
+        ]
+    }
+
+    #[test]
+    fn a_stereo_bag_needs_no_configuration() {
+        let plan = TopicPlan::resolve(&stereo(), &InputConfig::default()).unwrap();
+        assert_eq!((plan.cameras[0].image, plan.cameras[0].info), (1, 2));
+        assert_eq!((plan.cameras[1].image, plan.cameras[1].info), (0, 3));
+        assert_eq!(plan.pose, PoseTopic::Message(4));
+        assert_eq!(plan.tf_static, vec![5]);
+    }
+
+    #[test]
+    fn raw_wins_over_its_compressed_twin_and_truth_is_never_input() {
+        let mut topics = stereo();
+        topics.push(topic("/camera/left/image_rect", IMAGE));
+        topics.push(topic("/ground_truth/camera/left/depth", IMAGE));
+        topics.push(topic("/ground_truth/odom", POSE_TYPES[0]));
+        let plan = TopicPlan::resolve(&topics, &InputConfig::default()).unwrap();
+        assert_eq!(plan.cameras.len(), 2);
+        assert_eq!(plan.cameras[0].image, 6);
+        assert_eq!(plan.truth, vec![(0, TruthKind::Depth, 7)]);
+    }
+
+    #[test]
+    fn ambiguity_lists_the_candidates() {
+        let mut topics = stereo();
+        topics.push(topic("/other_pose", POSE_TYPES[1]));
+        let e = TopicPlan::resolve(&topics, &InputConfig::default()).unwrap_err().to_string();
+        assert!(e.contains("/other_pose") && e.contains("/odometry") && e.contains("input.pose"), "{e}");
+        let config = InputConfig { pose: "/other_pose".into(), ..Default::default() };
+        assert_eq!(TopicPlan::resolve(&topics, &config).unwrap().pose, PoseTopic::Message(6));
+        let mut topics = stereo();
+        topics.push(topic("/camera/left/image_raw", IMAGE));
+        let e = TopicPlan::resolve(&topics, &InputConfig::default()).unwrap_err().to_string();
+        assert!(e.contains("two pictures of one camera"), "{e}");
+    }
+
+    #[test]
+    fn what_is_missing_is_said() {
+        let e = TopicPlan::resolve(&stereo()[2..], &InputConfig::default()).unwrap_err().to_string();
+        assert!(e.contains("no camera image topic") && e.contains("/odometry"), "{e}");
+        let e = TopicPlan::resolve(&stereo()[..4], &InputConfig::default()).unwrap_err().to_string();
+        assert!(e.contains("no vehicle pose"), "{e}");
+        let config = InputConfig { pose: "/odom".into(), ..Default::default() };
+        let e = TopicPlan::resolve(&stereo(), &config).unwrap_err().to_string();
+        assert!(e.contains("/odom,") && e.contains("/odometry"), "{e}");
+    }
+
+    #[test]
+    fn numbers_in_names_sort_as_numbers() {
+        let mut names = ["/camera10/image", "/camera9/image", "/camera1/image"];
+        names.sort_by_key(|n| natural(n));
+        assert_eq!(names, ["/camera1/image", "/camera9/image", "/camera10/image"]);
+    }
+}
