@@ -8,7 +8,7 @@ pub mod error;
 pub mod picture;
 pub mod ply;
 pub mod qos;
-//report
+pub mod report;
 pub mod tracks_csv;
 pub mod tum;
 
