@@ -135,7 +135,7 @@ fn finish(p: &RasterPicture, what: What) -> Result<Picture> {
         }
         What::Flow => {
             let flow: Vec<[f32; 3]> = channels(3).collect();
-            with_flow_wheel(&flow_picture(w, h, &flow, FULL_SPEED_MPS)?, FULL_SPEED_MPS)
+            with_flow_wheel(&flow_picture(w, h, &flow, None, FULL_SPEED_MPS)?, FULL_SPEED_MPS)
         }
     })
 }

@@ -4,7 +4,7 @@ use glam::Vec3;
 use storm_model::scene::Scene;
 use storm_render::Gaussians;
 
-use crate::config::{MapConfig, TracksConfig};
+use crate::config::TracksConfig;
 use crate::rigid::Rigid;
 use crate::tracks::TrackPoint;
 
@@ -27,17 +27,6 @@ fn per_step(scene: &Scene) -> usize {
 /// Indices of the Gaussians seen at timesteps `first..`.
 pub fn from_step(scene: &Scene, first: usize) -> std::ops::Range<usize> {
     per_step(scene) * first..scene.gaussians.len()
-}
-
-/// The weight a Gaussian enters the map with, or `None` if it stays out: only what stands still, is opaque enough and
-/// not too far from its own camera (depth error grows with the square of depth, so the weight falls with it).
-pub fn map_weight(scene: &Scene, i: usize, camera: Vec3, config: &MapConfig) -> Option<f32> {
-    let opacity = scene.gaussians.opacities[i];
-    let distance = camera.distance(Vec3::from(scene.gaussians.means[i]));
-    let stays = (speed_mps(scene, i) as f64) < config.static_speed_mps
-        && opacity as f64 >= config.min_opacity
-        && (distance as f64) <= config.max_depth_m;
-    stays.then(|| opacity / (1.0 + distance * distance))
 }
 
 /// The newest timestep's moving Gaussians in map coordinates.

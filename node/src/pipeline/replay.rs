@@ -57,7 +57,8 @@ pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
     describe(&source, &rig, &engine, size);
     std::fs::create_dir_all(&options.out)
         .with_context(|| format!("cannot make results folder {}", options.out.display()))?;
-    let sink = Sink::create(&options.out, &rig, &engine, config)?;
+    let title = options.bag.file_name().map_or_else(|| "bag".into(), |n| n.to_string_lossy());
+    let sink = Sink::create(&title, &options.out, &rig, &engine, config)?;
     let weights = engine.weights().to_string();
     let preset = engine.model_config().describe();
 

@@ -4,15 +4,14 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
-use glam::Vec3;
 use storm_model::ModelError;
-use storm_model::scene::{RenderedView, Scene, Want};
+use storm_model::scene::{Affine, RenderedView, Scene, Want};
 use storm_render::Intrinsics;
 use tracing::warn;
 
-use crate::config::Config;
+use crate::config::{Config, MapConfig};
 use crate::engine::{Engine, select, views_of};
-use crate::map::VoxelMap;
+use crate::map::{VoxelMap, color01, static_weight};
 use crate::source::Frame;
 use crate::tracks::{Track, Tracker};
 use crate::window::Window;
@@ -81,7 +80,7 @@ impl StepMaker {
             let want = Want { flow: true, motion: true };
             self.timings.time("render", || self.engine.render(&scene, &targets, time_sec, want))?
         };
-        self.timings.time("map", || add_to_map(&mut self.map, &scene, &window, &self.config));
+        self.timings.time("map", || add_to_map(&mut self.map, &scene, &window, &self.config.map));
         let points = select::moving_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
         self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
         let total_ms = start.elapsed().as_secs_f64() * 1e3;
@@ -119,23 +118,18 @@ pub fn newest_time_sec(window: &Window<Frame>) -> f32 {
 }
 
 /// Merges what stands still into the map, once per image: only timesteps that were in no earlier window.
-fn add_to_map(map: &mut VoxelMap, scene: &Scene, window: &Window<Frame>, config: &Config) {
+fn add_to_map(map: &mut VoxelMap, scene: &Scene, window: &Window<Frame>, config: &MapConfig) {
     let first_new = window.steps.len() - window.new_steps.min(window.steps.len());
-    let per_view = scene.shape.height * scene.shape.width;
-    let views = scene.shape.cameras;
-    let cameras: Vec<Vec3> = (0..window.steps.len() * views)
-        .map(|k| window.anchor_from_camera(k / views, k % views).translation.as_vec3())
-        .collect();
     let picked = select::from_step(scene, first_new);
+    let exposure = Affine::mean(&scene.affine);
     map.insert(
         &window.map_from_anchor,
         &scene.gaussians,
         |i| {
-            if !picked.contains(&i) {
-                return None;
-            }
-            select::map_weight(scene, i, *cameras.get(i / per_view)?, &config.map)
+            let opacity = scene.gaussians.opacities[i];
+            let weight = || static_weight(config, opacity, select::speed_mps(scene, i), scene.depths[i]);
+            if picked.contains(&i) { weight() } else { None }
         },
-        |i| scene.display_color(scene.gaussians.colors[i], None),
+        |i| color01(&exposure.apply(scene.gaussians.colors[i])),
     );
 }

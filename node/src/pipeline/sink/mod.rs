@@ -3,7 +3,7 @@
 mod gallery;
 mod topics;
 
-pub use topics::{ANCHOR_FRAME, ORIGIN_FRAME, Publisher, motion_mask, surface_depth};
+pub use topics::{ANCHOR_FRAME, ORIGIN_FRAME, PREFIX, Publisher, motion_mask, surface_depth};
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,7 +26,7 @@ use super::front::TruthImage;
 use super::metrics::{Counts, Metrics};
 use super::step::{Finished, Step};
 use super::timing::{Timings, peak_rss_mb};
-use gallery::Gallery;
+use gallery::{Gallery, Run};
 
 /// One thing to write.
 pub enum SinkInput {
@@ -54,6 +54,7 @@ pub enum SinkInput {
 
 /// The writer's state over a run.
 pub struct Sink {
+    title: String,
     out: PathBuf,
     rig: Arc<Rig>,
     config: Config,
@@ -68,8 +69,8 @@ pub struct Sink {
 }
 
 impl Sink {
-    /// Starts the results folder `out` (which is there).
-    pub fn create(out: &Path, rig: &Arc<Rig>, engine: &Engine, config: &Config) -> Result<Self> {
+    /// Starts the results folder `out` (which is there); `title` heads the report.
+    pub fn create(title: &str, out: &Path, rig: &Arc<Rig>, engine: &Engine, config: &Config) -> Result<Self> {
         let publisher = match config.output.bag {
             true => Some(Publisher::create(&out.join("outputs.mcap"), rig.cameras.len())?),
             false => None,
@@ -79,6 +80,7 @@ impl Sink {
             false => None,
         };
         Ok(Self {
+            title: title.to_string(),
             out: out.to_path_buf(),
             rig: rig.clone(),
             config: config.clone(),
@@ -136,7 +138,14 @@ impl Sink {
         let Self { out, config, publisher, scorer, gallery, poses, .. } = self;
         let place = |name: &str| out.join(name);
         let origin = finished.map.origin();
-        let cloud: PlyCloud = finished.map.cloud();
+        let map = finished.map.cloud();
+        let cloud = PlyCloud {
+            positions: map.positions.clone(),
+            colors01: map.colors01.clone(),
+            opacities: map.opacities.clone(),
+            scales: map.scales.clone(),
+            quats: map.quats.clone(),
+        };
         let notes = [
             format!("storm {}; weights: {weights}; model: {model}", env!("CARGO_PKG_VERSION")),
             "static map without the sky; positions in metres, relative to origin_m in the map frame".to_string(),
@@ -181,7 +190,7 @@ impl Sink {
             gaussians: self.last_gaussians,
             gaussians_left_out: left_out,
             map_gaussians: cloud.len() as u64,
-            map_evicted: finished.map.evicted(),
+            map_evicted: finished.map.counts().evicted,
             tracks: finished.tracks.len() as u64,
             origin_m: origin.to_array(),
             epochs: self.epochs,
@@ -189,7 +198,9 @@ impl Sink {
         };
         let json = serde_json::to_string_pretty(&metrics).context("metrics.json")?;
         std::fs::write(place("metrics.json"), json + "\n").context("cannot write metrics.json")?;
-        gallery.write(&place("report.html"), &self.rig, &metrics, &cloud, origin, &rows, &poses, &config)?;
+        let title = self.title;
+        let run = Run { title: &title, metrics: &metrics, map: &map, tracks: &rows, poses: &poses, config: &config };
+        gallery.write(&place("report.html"), &self.rig, &run)?;
         Ok(metrics)
     }
 }
@@ -199,7 +210,7 @@ fn track_rows(track: &crate::tracks::Track) -> impl Iterator<Item = TrackRow> + 
         track_id: track.id,
         stamp_ns: p.stamp_ns,
         position_m: p.position_map.to_array(),
-        velocity_mps: p.velocity_map_mps.to_array(),
+        velocity_mps: p.velocity_map_mps.as_vec3().to_array(),
         motion_id: p.motion_id,
     })
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Result;
 use glam::{DVec3, Vec3};
-use storm_model::scene::RenderedView;
+use storm_model::scene::{Affine, RenderedView};
 use storm_render::Intrinsics;
 
 use crate::cdr::encode;
@@ -14,7 +14,8 @@ use crate::engine::select;
 use crate::msg::{CameraInfo, Header, Image, PointCloud2, PoseStamped, TransformStamped};
 use crate::output::bag_writer::{BagWriter, TopicId};
 use crate::output::cloud::{FlowCloud, GaussianCloud, MapCloud, NO_TRACK, flow_cloud, gaussian_cloud, map_cloud};
-use crate::output::picture;
+use crate::map::color01;
+use crate::output::picture::{Picture, mask_overlay};
 use crate::output::ply::PlyCloud;
 use crate::output::qos::Qos;
 use crate::pipeline::step::{Step, newest_time_sec};
@@ -111,12 +112,13 @@ impl Publisher {
         let (picked, left_out) = select::opaque_enough(g, config.output.min_opacity, limit);
         self.truncated += left_out as u64;
         let time_sec = newest_time_sec(&step.window);
+        let exposure = Affine::mean(&scene.affine);
         let pick3 = |from: &[[f32; 3]]| -> Vec<[f32; 3]> { picked.iter().map(|&i| from[i]).collect() };
         let built = gaussian_cloud(
             header,
             &GaussianCloud {
                 positions: &picked.iter().map(|&i| g.mean_at(i, time_sec)).collect::<Vec<_>>(),
-                colors01: &picked.iter().map(|&i| scene.display_color(g.colors[i], None)).collect::<Vec<_>>(),
+                colors01: &picked.iter().map(|&i| color01(&exposure.apply(g.colors[i]))).collect::<Vec<_>>(),
                 velocities: &pick3(&g.velocity_forward),
                 opacities: &picked.iter().map(|&i| g.opacities[i]).collect::<Vec<_>>(),
                 scales: &pick3(&g.scales),
@@ -149,8 +151,10 @@ impl Publisher {
         // The pictures carry their source image's stamp and frame.
         let stamp_ns = newest.frames[camera].stamp_ns;
         let header = Header { stamp_ns, frame_id: rig.cameras[camera].frame_id.clone() };
-        let rgb = picture::rgb_from_network(&view.color);
+        let rgb = view.rgb8();
         let mask = motion_mask(view);
+        let ids: Vec<u16> = mask.iter().map(|&m| u16::from(m)).collect();
+        let over = mask_overlay(&Picture::from_rgb8(view.width, view.height, &rgb)?, &ids)?.as_bytes().to_vec();
         let image = |encoding: &str, bytes_per_pixel: usize, data: Vec<u8>| Image {
             header: header.clone(),
             height: view.height as u32,
@@ -161,7 +165,6 @@ impl Publisher {
             data,
         };
         let depth: Vec<u8> = surface_depth(view).iter().flat_map(|d| d.to_le_bytes()).collect();
-        let over = picture::mask_overlay(&rgb, &mask);
         let topics = &self.cameras[camera];
         let messages = [
             (topics.rendered, encode::encode_image(&image("rgb8", 3, rgb))?),
