@@ -114,7 +114,10 @@ impl ClipBatch {
     /// `(b, t, v, h, w)`, after checking that all tensors agree.
     pub(crate) fn dims(&self) -> Result<[usize; 5], ModelError> {
         let &[b, t, v, 3, h, w] = self.image.dims() else {
-            return Err(ModelError::Input(format!("image has shape {:?}, expected (b, t, v, 3, h, w)", self.image.dims())));
+            return Err(ModelError::Input(format!(
+                "image has shape {:?}, expected (b, t, v, 3, h, w)",
+                self.image.dims()
+            )));
         };
         check_counts(t, v)?;
         let expected: [(&str, &Tensor, Vec<usize>); 3] = [
@@ -225,7 +228,10 @@ mod tests {
         assert!(error.contains("camera 1") && error.contains("image") && error.contains('2'), "{error}");
         let mut lost = view(&good);
         lost.world_from_camera.translation.x = f32::NAN;
-        assert!(matches!(make(lost), Err(ModelError::NonFiniteInput { what: "pose", camera: 1, timestep: 0, count: 1 })));
+        assert!(matches!(
+            make(lost),
+            Err(ModelError::NonFiniteInput { what: "pose", camera: 1, timestep: 0, count: 1 })
+        ));
         let mut flat = view(&good);
         flat.intrinsics.fx = 0.0;
         assert!(make(flat).is_err());

@@ -25,7 +25,9 @@ pub enum ModelError {
     #[error("clip input: {0}")]
     Input(String),
     /// A clip that holds a NaN or an infinity.
-    #[error("clip input: {count} non-finite value(s) in the {what} of camera {camera} at timestep {timestep}; drop that frame")]
+    #[error(
+        "clip input: {count} non-finite value(s) in the {what} of camera {camera} at timestep {timestep}; drop that frame"
+    )]
     NonFiniteInput {
         /// Image, intrinsics, pose or time.
         what: &'static str,

@@ -71,7 +71,8 @@ impl GaussianHead {
             depths: depth.squeeze(D::Minus1)?,
             scales: scales.broadcast_minimum(&self.max_scale)?,
             quats: raw.narrow(D::Minus1, 4, 4)?.contiguous()?,
-            opacities: sigmoid(&raw.narrow(D::Minus1, 8, 1)?.affine(1.0, config.opacity_offset)?)?.squeeze(D::Minus1)?,
+            opacities: sigmoid(&raw.narrow(D::Minus1, 8, 1)?.affine(1.0, config.opacity_offset)?)?
+                .squeeze(D::Minus1)?,
             colors,
         })
     }

@@ -91,7 +91,10 @@ impl ClipOutput {
             scales: read("scales", &self.scales)?.chunks_exact(3).map(triple).collect(),
             opacities: read("opacities", &self.opacities)?,
             colors: read("colors", &self.colors)?.chunks_exact(3).map(triple).collect(),
-            velocity_backward: read("velocity_backward", &self.velocity_backward)?.chunks_exact(3).map(triple).collect(),
+            velocity_backward: read("velocity_backward", &self.velocity_backward)?
+                .chunks_exact(3)
+                .map(triple)
+                .collect(),
             velocity_forward: read("velocity_forward", &self.velocity_forward)?.chunks_exact(3).map(triple).collect(),
             time_sec: times.iter().flat_map(|&time| std::iter::repeat_n(time, h * w)).collect(),
             motion_count,
@@ -106,7 +109,9 @@ impl ClipOutput {
             _ => None,
         };
         let affine = match &self.affine {
-            Some(affine) => read("affine", affine)?.chunks_exact(12).map(|a| Affine::new(self.config.affine, a)).collect(),
+            Some(affine) => {
+                read("affine", affine)?.chunks_exact(12).map(|a| Affine::new(self.config.affine, a)).collect()
+            }
             None => Vec::new(),
         };
         let motion_bases = match &self.motion_bases {

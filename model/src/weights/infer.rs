@@ -98,8 +98,7 @@ fn mask_decoder(config: &mut ModelConfig, shapes: &BTreeMap<String, Vec<usize>>)
         config.key_hidden = first("motion_key_head.fc1.weight")?;
         config.projected_motion_dim = first("motion_key_head.fc2.weight")?;
     }
-    let basis =
-        if paper && config.num_motion_tokens > 0 { "motion_basis_decoders.0" } else { "motion_basis_decoder" };
+    let basis = if paper && config.num_motion_tokens > 0 { "motion_basis_decoders.0" } else { "motion_basis_decoder" };
     config.basis_hidden = first(&format!("{basis}.fc1.weight"))?;
     config.velocity = match first(&format!("{basis}.fc2.weight"))? {
         6 => VelocityKind::ForwardBackward,

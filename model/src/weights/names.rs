@@ -203,7 +203,8 @@ mod tests {
     #[test]
     fn names_are_unique_and_sizes_are_positive() {
         for name in ["tiny", "small", "b8", "xl16"] {
-            for config in [ModelConfig::preset(name).unwrap(), ModelConfig::preset(name).unwrap().with_paper_choices()] {
+            for config in [ModelConfig::preset(name).unwrap(), ModelConfig::preset(name).unwrap().with_paper_choices()]
+            {
                 let specs = tensor_specs(&config);
                 let names: std::collections::BTreeSet<_> = specs.iter().map(|s| s.name.as_str()).collect();
                 assert_eq!(names.len(), specs.len());

@@ -121,8 +121,15 @@ pub(super) struct Pickle {
 impl Pickle {
     /// Reads a whole pickle, protocols 2 to 5.
     pub fn read(bytes: &[u8]) -> Result<Self, PickleError> {
-        let mut machine =
-            Machine { bytes, at: 0, op_at: 0, nodes: Vec::new(), stack: Vec::new(), marks: Vec::new(), memo: HashMap::new() };
+        let mut machine = Machine {
+            bytes,
+            at: 0,
+            op_at: 0,
+            nodes: Vec::new(),
+            stack: Vec::new(),
+            marks: Vec::new(),
+            memo: HashMap::new(),
+        };
         let root = machine.run()?;
         Ok(Self { nodes: machine.nodes, root })
     }
@@ -480,7 +487,9 @@ mod tests {
 
     #[test]
     fn a_call_of_anything_else_is_refused_by_name() {
-        for program in [&b"\x80\x02cos\nsystem\nX\x02\x00\x00\x00ls\x85R."[..], b"\x80\x04\x8c\x02os\x8c\x06system\x93."] {
+        for program in
+            [&b"\x80\x02cos\nsystem\nX\x02\x00\x00\x00ls\x85R."[..], b"\x80\x04\x8c\x02os\x8c\x06system\x93."]
+        {
             let error = Pickle::read(program).unwrap_err();
             assert!(error.reason.contains("os.system"), "{error:?}");
         }
@@ -512,7 +521,9 @@ mod tests {
 
     #[test]
     fn claimed_lengths_do_not_allocate() {
-        for program in [&b"\x80\x04\x8d\xff\xff\xff\xff\xff\xff\xff\x7f"[..], b"\x80\x02X\xff\xff\xff\xffab", b"\x80\x02."] {
+        for program in
+            [&b"\x80\x04\x8d\xff\xff\xff\xff\xff\xff\xff\x7f"[..], b"\x80\x02X\xff\xff\xff\xffab", b"\x80\x02."]
+        {
             assert!(Pickle::read(program).is_err());
         }
     }

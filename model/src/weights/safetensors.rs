@@ -120,17 +120,20 @@ pub fn save_safetensors(
 ) -> Result<(), ModelError> {
     config.validate()?;
     super::check_shapes(config, tensors.iter().map(|(name, x)| (name.as_str(), x.dims())))?;
-    let saved: Vec<(&str, Saved)> =
-        tensors.iter().map(|(name, x)| Ok((name.as_str(), encode(name, x, dtype)?))).collect::<Result<_, ModelError>>()?;
+    let saved: Vec<(&str, Saved)> = tensors
+        .iter()
+        .map(|(name, x)| Ok((name.as_str(), encode(name, x, dtype)?)))
+        .collect::<Result<_, ModelError>>()?;
     let json = serde_json::to_string(config).map_err(|e| WeightsError::format(path, e.to_string()))?;
     let mut metadata = HashMap::from([(CONFIG_KEY.to_owned(), json)]);
     if !provenance.is_empty() {
         metadata.insert(PROVENANCE_KEY.to_owned(), provenance.to_owned());
     }
     let parts = saved.iter().map(|(name, x)| (*name, x));
-    let bytes = sorted_header(safetensors::serialize(parts, Some(metadata)).map_err(|e| {
-        WeightsError::format(path, format!("cannot be written: {e}"))
-    })?);
+    let bytes = sorted_header(
+        safetensors::serialize(parts, Some(metadata))
+            .map_err(|e| WeightsError::format(path, format!("cannot be written: {e}")))?,
+    );
     write_atomically(path, &bytes).map_err(|e| WeightsError::io(path, e))?;
     Ok(())
 }

@@ -152,9 +152,10 @@ fn tensor_ref(pickle: &Pickle, args: Id) -> Result<TensorRef, String> {
         return Err(format!("has shape {shape:?} and strides {strides:?}"));
     }
     let count = shape.iter().try_fold(1usize, |n, &side| n.checked_mul(side));
-    let last = shape.iter().zip(&strides).try_fold(offset, |at, (&side, &stride)| {
-        at.checked_add(side.saturating_sub(1).checked_mul(stride)?)
-    });
+    let last = shape
+        .iter()
+        .zip(&strides)
+        .try_fold(offset, |at, (&side, &stride)| at.checked_add(side.saturating_sub(1).checked_mul(stride)?));
     match (count, last) {
         // Fewer elements than the storage also rules out axes repeated with stride 0, whose size nothing would bound.
         (Some(count), Some(last)) if count <= numel && (last < numel || count == 0) => {
