@@ -1,0 +1,46 @@
+//! What can be wrong with a request to render.
+
+/// Why nothing was rendered.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RasterError {
+    /// A setting has no meaning.
+    #[error("raster setting `{name}` is {value}; it must be {need}")]
+    Setting {
+        /// The setting.
+        name: &'static str,
+        /// Its value.
+        value: f32,
+        /// What it must be.
+        need: &'static str,
+    },
+    /// Two arrays of the splats disagree in length.
+    #[error("splat array `{name}` holds {len} values but {expected} were expected for {splats} means")]
+    Length {
+        /// The array.
+        name: &'static str,
+        /// Its length.
+        len: usize,
+        /// The length that fits `means`.
+        expected: usize,
+        /// Length of `means`.
+        splats: usize,
+    },
+    /// More splats or channels than the index types hold.
+    #[error("{value} {name} are more than the {limit} that can be rendered at once; render in parts")]
+    TooMany {
+        /// What there is too much of.
+        name: &'static str,
+        /// How many.
+        value: usize,
+        /// The limit.
+        limit: usize,
+    },
+    /// A camera that cannot take a picture.
+    #[error("view {view}: {what}")]
+    View {
+        /// Index of the view.
+        view: usize,
+        /// What is wrong, the value and the fix.
+        what: String,
+    },
+}

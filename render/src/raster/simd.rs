@@ -1,0 +1,134 @@
+//! One source, several compilations: which vector instructions the machine has, and the arithmetic that differs.
+//!
+//! The inner loops are plain code over lane arrays, `#[inline(always)]` and generic over `FMA`; [`dispatch!`] compiles
+//! them again inside functions that enable AVX2 or AVX-512, where the compiler turns each lane loop into vectors.
+
+/// Instruction sets the kernels are compiled for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Isa {
+    /// What the build target guarantees.
+    Portable,
+    /// x86 with AVX2 and FMA.
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    /// x86 with AVX-512 F, VL, BW, DQ.
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+}
+
+impl Isa {
+    /// The widest this machine runs.
+    pub(crate) fn detect() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            let avx512 = is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512bw")
+                && is_x86_feature_detected!("avx512dq");
+            if avx2 && avx512 {
+                return Self::Avx512;
+            }
+            if avx2 {
+                return Self::Avx2;
+            }
+        }
+        Self::Portable
+    }
+}
+
+/// True when the build target itself has a fused multiply-add (then `mul_add` is one instruction, not a call).
+pub(crate) const TARGET_FMA: bool = cfg!(any(target_feature = "fma", target_arch = "aarch64"));
+
+/// Defines `fn $name(isa, args...)`, which runs the `#[inline(always)]` generic `$kernel::<FMA>(args...)` compiled for `isa`.
+macro_rules! dispatch {
+    ($(#[$doc:meta])* $name:ident, $kernel:ident, ($($arg:ident: $ty:ty),* $(,)?)) => {
+        $(#[$doc])*
+        pub(crate) fn $name(isa: $crate::raster::simd::Isa, $($arg: $ty),*) {
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx2,fma")]
+            fn avx2($($arg: $ty),*) {
+                $kernel::<true>($($arg),*)
+            }
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
+            fn avx512($($arg: $ty),*) {
+                $kernel::<true>($($arg),*)
+            }
+            match isa {
+                $crate::raster::simd::Isa::Portable => $kernel::<{ $crate::raster::simd::TARGET_FMA }>($($arg),*),
+                #[cfg(target_arch = "x86_64")]
+                // SAFETY: `Isa::Avx2` is only made by `Isa::detect` after the CPU reported these features.
+                $crate::raster::simd::Isa::Avx2 => unsafe { avx2($($arg),*) },
+                #[cfg(target_arch = "x86_64")]
+                // SAFETY: `Isa::Avx512` is only made by `Isa::detect` after the CPU reported these features.
+                $crate::raster::simd::Isa::Avx512 => unsafe { avx512($($arg),*) },
+            }
+        }
+    };
+}
+pub(crate) use dispatch;
+
+/// `a * b + c`, fused where that is one instruction.
+#[inline(always)]
+pub(crate) fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
+    if FMA { a.mul_add(b, c) } else { a * b + c }
+}
+
+/// `a * b + c` in f64, fused where that is one instruction.
+#[inline(always)]
+pub(crate) fn fma64<const FMA: bool>(a: f64, b: f64, c: f64) -> f64 {
+    if FMA { a.mul_add(b, c) } else { a * b + c }
+}
+
+/// Relative error bound of [`exp2_neg`] on `0 <= x <= 126`: 0.9e-7 from the polynomial, the rest f32 rounding.
+#[cfg(test)]
+pub(crate) const EXP2_TOLERANCE: f64 = 2e-7;
+
+/// `2^-x` for `x >= 0`, relative error at most 2e-7, exactly 1 at 0; beyond 126 (infinity included) stays at `2^-126`.
+///
+/// `2^-x = 2^n 2^r` with `n` the nearest integer and a degree-5 minimax polynomial in `r`, `|r| <= 1/2`.
+#[inline(always)]
+pub(crate) fn exp2_neg<const FMA: bool>(x: f32) -> f32 {
+    // Adding 1.5 * 2^23 rounds to an integer and leaves it in the low mantissa bits.
+    const ROUND: f32 = 12_582_912.0;
+    let y = -(if x < 126.0 { x } else { 126.0 });
+    let shifted = y + ROUND;
+    let r = y - (shifted - ROUND);
+    let mut p = 1.326_472_2e-3;
+    p = fma::<FMA>(p, r, 9.671_513e-3);
+    p = fma::<FMA>(p, r, 5.550_734e-2);
+    p = fma::<FMA>(p, r, 2.402_224_2e-1);
+    p = fma::<FMA>(p, r, 6.931_47e-1);
+    p = fma::<FMA>(p, r, 1.0);
+    // 2^n: n added to the exponent field; the bits of ROUND itself are shifted out.
+    f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exp2_stays_within_its_stated_error() {
+        let mut worst = 0.0f64;
+        for step in 0..1_000_000u32 {
+            let x = step as f32 * 1.26e-4;
+            let exact = (-f64::from(x)).exp2();
+            for got in [exp2_neg::<false>(x), exp2_neg::<true>(x)] {
+                worst = worst.max((f64::from(got) / exact - 1.0).abs());
+            }
+        }
+        println!("worst relative error {worst:e}");
+        assert!(worst <= EXP2_TOLERANCE, "{worst:e}");
+        assert_eq!(exp2_neg::<true>(0.0), 1.0);
+    }
+
+    #[test]
+    fn exp2_never_leaves_the_finite_numbers() {
+        for x in [126.0, 127.0, 1e30, f32::MAX, f32::INFINITY, f32::NAN] {
+            let y = exp2_neg::<false>(x);
+            assert!(y > 0.0 && y < 1.2e-38, "{x} gave {y}");
+        }
+    }
+}

@@ -1,0 +1,277 @@
+//! Chunks of Gaussians to tile lists: each chunk is projected into all views and sorted by tile on its own, so that a
+//! tile finds its splats by visiting the chunks in order. No shared writes, and the same lists for any thread count.
+
+use super::project::{Block, Camera, Footprints, LANES, Rules};
+use super::simd::dispatch;
+use super::sort::key;
+use super::{MAX_PAIRS, Splats};
+use bytemuck::{Pod, Zeroable};
+use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Tile width, pixels: wide enough that few splats are listed twice.
+pub(crate) const TILE_W: usize = 32;
+/// Tile height, pixels: low enough that the accumulators of a tile stay in the first-level cache.
+pub(crate) const TILE_H: usize = 16;
+
+/// A splat as the blending reads it: half a cache line.
+///
+/// `alpha = opacity 2^-(across (dx - slope dy)^2 + along dy^2)` at `(dx, dy)` from the centre, which is stored relative
+/// to the box corner: the f32 keeps its digits however wide the picture is.
+#[repr(C, align(32))]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(crate) struct Record {
+    /// Centre minus the box corner `(x0, y0)`, pixels.
+    pub(crate) u: f32,
+    pub(crate) v: f32,
+    pub(crate) slope: f32,
+    pub(crate) across: f32,
+    pub(crate) along: f32,
+    pub(crate) opacity: f32,
+    /// Pixel box `[x0, x1) x [y0, y1)`, never empty, inside the picture.
+    pub(crate) x0: u16,
+    pub(crate) y0: u16,
+    pub(crate) x1: u16,
+    pub(crate) y1: u16,
+}
+
+/// Where the tiles of each view stand in the list of all tiles.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Grid {
+    views: Vec<GridView>,
+}
+
+/// Tiles of one view.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct GridView {
+    pub(crate) first: usize,
+    pub(crate) columns: usize,
+    pub(crate) rows: usize,
+}
+
+impl Grid {
+    pub(crate) fn new(sizes: impl Iterator<Item = (usize, usize)>) -> Self {
+        let mut first = 0;
+        let views = sizes
+            .map(|(width, height)| {
+                let view = GridView { first, columns: width.div_ceil(TILE_W), rows: height.div_ceil(TILE_H) };
+                first += view.columns * view.rows;
+                view
+            })
+            .collect();
+        Self { views }
+    }
+
+    pub(crate) fn views(&self) -> &[GridView] {
+        &self.views
+    }
+
+    pub(crate) fn tile_count(&self) -> usize {
+        self.views.last().map_or(0, |v| v.first + v.columns * v.rows)
+    }
+}
+
+impl GridView {
+    /// Calls `visit` with the index of every tile the box of `record` meets.
+    #[inline(always)]
+    fn each_tile(&self, record: &Record, mut visit: impl FnMut(usize)) {
+        let columns = usize::from(record.x0) / TILE_W..usize::from(record.x1).div_ceil(TILE_W);
+        for row in usize::from(record.y0) / TILE_H..usize::from(record.y1).div_ceil(TILE_H) {
+            let first = self.first + row * self.columns;
+            for column in columns.clone() {
+                visit(first + column);
+            }
+        }
+    }
+}
+
+/// The splats of a chunk that have pixels in one view, in index order.
+#[derive(Debug, Default)]
+pub(crate) struct ChunkView {
+    pub(crate) records: Vec<Record>,
+    /// Camera z, metres.
+    pub(crate) depths: Vec<f32>,
+    /// Index of the Gaussian.
+    pub(crate) ids: Vec<u32>,
+}
+
+/// One chunk of consecutive Gaussians: its splats per view and its keys per tile.
+#[derive(Debug, Default)]
+pub(crate) struct Chunk {
+    pub(crate) views: Vec<ChunkView>,
+    /// Where each tile's keys start in `keys`; one more entry than tiles.
+    starts: Vec<u32>,
+    /// Sort keys, tile after tile, index order inside a tile.
+    keys: Vec<u64>,
+    pub(crate) invalid: usize,
+    pub(crate) visible: usize,
+}
+
+/// What all chunks share.
+pub(crate) struct ChunkInput<'a> {
+    pub(crate) splats: Splats<'a>,
+    pub(crate) cameras: &'a [Camera],
+    pub(crate) rules: Rules,
+    pub(crate) grid: &'a Grid,
+    /// Keys of all chunks so far; a chunk that passes [`MAX_PAIRS`] keeps none.
+    pub(crate) pairs: &'a AtomicUsize,
+}
+
+impl Chunk {
+    /// Keys of one tile, in index order.
+    pub(crate) fn tile_keys(&self, tile: usize) -> &[u64] {
+        match (self.starts.get(tile), self.starts.get(tile + 1)) {
+            (Some(&from), Some(&to)) => self.keys.get(from as usize..to as usize).unwrap_or_default(),
+            _ => &[],
+        }
+    }
+
+    /// Sorts the chunk's splats by tile (counting sort, stable). `first_slot` is the slot of its first splat.
+    fn bin(&mut self, input: &ChunkInput, first_slot: u32) {
+        let tiles = input.grid.tile_count();
+        self.starts.clear();
+        self.starts.resize(tiles + 1, 0);
+        let mut total = 0usize;
+        for (view, grid) in self.views.iter().zip(input.grid.views()) {
+            for record in &view.records {
+                grid.each_tile(record, |tile| {
+                    self.starts[tile] = self.starts[tile].wrapping_add(1);
+                    total += 1;
+                });
+            }
+        }
+        self.keys.clear();
+        if input.pairs.fetch_add(total, Ordering::Relaxed).saturating_add(total) > MAX_PAIRS {
+            self.starts.fill(0);
+            return;
+        }
+        // Counts become ends; filling backwards turns them into starts.
+        let mut end = 0;
+        for s in self.starts.iter_mut() {
+            end += *s;
+            *s = end;
+        }
+        self.keys.resize(total, 0);
+        for (view, grid) in self.views.iter().zip(input.grid.views()) {
+            for (k, (record, &depth)) in view.records.iter().zip(&view.depths).enumerate().rev() {
+                let key = key(depth, first_slot + k as u32);
+                grid.each_tile(record, |tile| {
+                    self.starts[tile] -= 1;
+                    self.keys[self.starts[tile] as usize] = key;
+                });
+            }
+        }
+    }
+}
+
+dispatch!(
+    /// Projects the Gaussians `range` into all views and lists them by tile.
+    fill_chunk, fill_chunk_kernel, (input: &ChunkInput<'_>, range: Range<usize>, first_slot: u32, chunk: &mut Chunk)
+);
+
+#[inline(always)]
+fn fill_chunk_kernel<const FMA: bool>(input: &ChunkInput, range: Range<usize>, first_slot: u32, chunk: &mut Chunk) {
+    let splats = &input.splats;
+    chunk.views.resize_with(input.cameras.len(), ChunkView::default);
+    for view in &mut chunk.views {
+        view.records.clear();
+        view.depths.clear();
+        view.ids.clear();
+    }
+    (chunk.invalid, chunk.visible) = (0, 0);
+    let rows = range.start * splats.feature_count..range.end * splats.feature_count;
+    let features_finite = all_finite(splats.features.get(rows).unwrap_or_default());
+    let mut block = Block::new();
+    let mut prints = Footprints::new();
+    for start in range.clone().step_by(LANES) {
+        let count = (range.end - start).min(LANES);
+        chunk.invalid += block.load(splats, start, count, features_finite);
+        for (camera, view) in input.cameras.iter().zip(&mut chunk.views) {
+            if super::project::project::<FMA>(&block, camera, &input.rules, &mut prints) {
+                chunk.visible += view.keep(&block, &prints, splats, start);
+            }
+        }
+    }
+    chunk.bin(input, first_slot);
+}
+
+/// True when no number is infinite or NaN: its exponent bits are not all ones.
+#[inline(always)]
+fn all_finite(values: &[f32]) -> bool {
+    const EXPONENT: u32 = 0x7f80_0000;
+    let (blocks, rest) = values.as_chunks::<64>();
+    let bad = |x: f32| u32::from(x.to_bits() & EXPONENT == EXPONENT);
+    let mut any = [0u32; 64];
+    for block in blocks {
+        for l in 0..64 {
+            any[l] |= bad(block[l]);
+        }
+    }
+    any.iter().fold(0, |a, b| a | b) == 0 && rest.iter().all(|&x| bad(x) == 0)
+}
+
+impl ChunkView {
+    /// Keeps the visible lanes that have a pixel to blend; returns how many lanes are visible.
+    #[inline(always)]
+    fn keep(&mut self, block: &Block, prints: &Footprints, splats: &Splats, start: usize) -> usize {
+        let mut visible = 0;
+        for l in 0..LANES {
+            if !prints.visible[l] {
+                continue;
+            }
+            visible += 1;
+            let (x0, x1, y0, y1) = (prints.x0[l], prints.x1[l], prints.y0[l], prints.y1[l]);
+            let blended = block.reach2[l] >= 0.0 && x0 < x1 && y0 < y1;
+            if !blended {
+                continue;
+            }
+            let (slope, across, along) = prints.quadratic(l);
+            let id = start + l;
+            self.records.push(Record {
+                u: (prints.u[l] - x0) as f32,
+                v: (prints.v[l] - y0) as f32,
+                slope,
+                across,
+                along,
+                opacity: splats.opacities[id].min(super::settings::OPACITY_CEILING),
+                x0: x0 as u16,
+                y0: y0 as u16,
+                x1: x1 as u16,
+                y1: y1 as u16,
+            });
+            self.depths.push(prints.z[l] as f32);
+            self.ids.push(id as u32);
+        }
+        visible
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn finite_check_sees_every_position() {
+        for n in [0, 1, 63, 64, 65, 200] {
+            assert!(all_finite(&vec![f32::MAX; n]));
+            for at in 0..n {
+                let mut values = vec![1.0; n];
+                values[at] = if at % 2 == 0 { f32::NAN } else { f32::NEG_INFINITY };
+                assert!(!all_finite(&values), "{n} {at}");
+            }
+        }
+    }
+
+    #[test]
+    fn boxes_meet_the_tiles_that_hold_their_pixels() {
+        let grid = Grid::new([(70, 33), (10, 10)].into_iter());
+        assert_eq!(grid.tile_count(), 3 * 3 + 1);
+        let record = Record { x0: 31, x1: 33, y0: 16, y1: 32, ..Record::zeroed() };
+        let mut met = Vec::new();
+        grid.views()[0].each_tile(&record, |t| met.push(t));
+        assert_eq!(met, [3, 4]);
+        met.clear();
+        grid.views()[1].each_tile(&Record { x1: 10, y1: 10, ..Record::zeroed() }, |t| met.push(t));
+        assert_eq!(met, [9]);
+    }
+}
