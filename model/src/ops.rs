@@ -1,17 +1,66 @@
 //! The operations the network is written in. Each picks the kernel where one covers the device and type, else the
 //! plain candle version in [`crate::plain`].
+//!
+//! Kernels ([`crate::kernels`]) take f32 tensors on the CPU that are not part of a gradient's graph; tensors that do not
+//! lie in row-major order are copied first. Everything else goes to [`crate::plain`]: other types (f64, f16, bf16), other
+//! devices, and whatever candle must differentiate (a variable, or a tensor computed from one). For inference with
+//! weights that are variables, detach them once (`Tensor::detach`) when the model is loaded.
 
-use candle_core::{Result, Tensor};
+use std::sync::{Arc, OnceLock};
 
+use candle_core::{D, Result, Tensor, TensorId};
+
+use crate::kernels::gemm::{self, Epilogue, PackedWeight};
+use crate::kernels::math::Function;
+use crate::kernels::tensors::{covered, with_optional, with_values};
+use crate::kernels::{self, Isa};
 use crate::plain;
 
 /// A linear layer: weight `(out, in)` as PyTorch stores it, optional bias `(out)`.
+///
+/// The kernel's layout of the weight is made at first use and shared by clones (it doubles the layer's memory). It
+/// belongs to this `weight` tensor: replacing the field is noticed, but writing into the storage of a tensor detached
+/// from a variable is not, so make a new `Linear` after such a change.
 #[derive(Debug, Clone)]
 pub struct Linear {
     /// `(out, in)`.
     pub weight: Tensor,
     /// `(out)`.
     pub bias: Option<Tensor>,
+    packed: Arc<OnceLock<(TensorId, PackedWeight)>>,
+}
+
+impl Linear {
+    /// A layer of a weight `(out, in)` and a bias `(out)`.
+    pub fn new(weight: Tensor, bias: Option<Tensor>) -> Self {
+        Self { weight, bias, packed: Arc::default() }
+    }
+
+    /// Makes the kernel's layout now, so that the first step is not slower than the others. Nothing to do for weights
+    /// the kernels do not cover.
+    pub fn prepare(&self) -> Result<()> {
+        match covered([&self.weight]) {
+            true => self.with_packed(|_| Ok(())),
+            false => Ok(()),
+        }
+    }
+
+    fn pack(&self) -> Result<PackedWeight> {
+        let (n, k) = self.weight.dims2()?;
+        with_values(&self.weight, |values| Ok(PackedWeight::new(Isa::detect(), values, n, k)))
+    }
+
+    fn with_packed<R>(&self, f: impl FnOnce(&PackedWeight) -> Result<R>) -> Result<R> {
+        let id = self.weight.id();
+        if self.packed.get().is_none() {
+            // Two threads may both get here; the first to finish wins and the other's work is dropped.
+            let _ = self.packed.set((id, self.pack()?));
+        }
+        match self.packed.get() {
+            Some((packed_id, packed)) if *packed_id == id => f(packed),
+            _ => f(&self.pack()?),
+        }
+    }
 }
 
 /// What follows a linear layer.
@@ -25,17 +74,116 @@ pub enum Activation {
     Silu,
 }
 
-/// See [`plain::attention`].
+/// See [`plain::attention`]. The kernel never holds the `n x n` weights.
 pub fn attention(qkv: &Tensor, heads: usize) -> Result<Tensor> {
-    plain::attention(qkv, heads)
+    let (batch, tokens, d3) = qkv.dims3()?;
+    if heads == 0 || d3 == 0 || d3 % (3 * heads) != 0 {
+        candle_core::bail!("attention: {d3} channels are not 3 x {heads} heads x a whole head size");
+    }
+    if !covered([qkv]) || batch * tokens == 0 {
+        return plain::attention(qkv, heads);
+    }
+    let shape = kernels::attention::Shape { batch, tokens, heads, head_dim: d3 / 3 / heads };
+    let mut out = vec![0f32; batch * tokens * d3 / 3];
+    with_values(qkv, |values| {
+        kernels::attention::attention(Isa::detect(), values, shape, &mut out);
+        Ok(())
+    })?;
+    Tensor::from_vec(out, (batch, tokens, d3 / 3), qkv.device())
 }
 
-/// See [`plain::linear`].
+/// See [`plain::linear`]. The kernel adds the bias, the activation and the residual while the sums are in cache.
 pub fn linear(x: &Tensor, layer: &Linear, act: Activation, residual: Option<&Tensor>) -> Result<Tensor> {
-    plain::linear(x, layer, act, residual)
+    let (n, k) = layer.weight.dims2()?;
+    let mut dims = x.dims().to_vec();
+    match dims.last_mut() {
+        Some(last) if *last == k => *last = n,
+        _ => candle_core::bail!("linear: input {:?} does not end in the weight's {k} inputs", x.dims()),
+    }
+    if let Some(bias) = &layer.bias
+        && bias.dims() != [n]
+    {
+        candle_core::bail!("linear: bias {:?} for {n} outputs", bias.dims());
+    }
+    let same_shape = residual.is_none_or(|r| r.dims() == dims);
+    let inputs = [Some(x), Some(&layer.weight), layer.bias.as_ref(), residual];
+    if !same_shape || x.elem_count() == 0 || !covered(inputs.into_iter().flatten()) {
+        return plain::linear(x, layer, act, residual);
+    }
+    let mut out = vec![0f32; dims.iter().product()];
+    with_values(x, |x| {
+        with_optional(layer.bias.as_ref(), |bias| {
+            with_optional(residual, |residual| {
+                layer.with_packed(|packed| {
+                    gemm::linear(x, packed, Epilogue { bias, act, residual }, &mut out);
+                    Ok(())
+                })
+            })
+        })
+    })?;
+    Tensor::from_vec(out, dims, x.device())
 }
 
-/// See [`plain::layer_norm`].
+/// See [`plain::layer_norm`]. The kernel takes mean and variance in f64.
 pub fn layer_norm(x: &Tensor, weight: Option<&Tensor>, bias: Option<&Tensor>, eps: f64) -> Result<Tensor> {
-    plain::layer_norm(x, weight, bias, eps)
+    let width = x.dim(D::Minus1)?;
+    for (name, learned) in [("weight", weight), ("bias", bias)] {
+        if let Some(learned) = learned
+            && learned.dims() != [width]
+        {
+            candle_core::bail!("layer norm: {name} {:?} for rows of {width}", learned.dims());
+        }
+    }
+    if x.elem_count() == 0 || !covered([Some(x), weight, bias].into_iter().flatten()) {
+        return plain::layer_norm(x, weight, bias, eps);
+    }
+    let mut out = vec![0f32; x.elem_count()];
+    with_values(x, |x| {
+        with_optional(weight, |weight| {
+            with_optional(bias, |bias| {
+                kernels::norm::layer_norm(Isa::detect(), x, width, weight, bias, eps, &mut out);
+                Ok(())
+            })
+        })
+    })?;
+    Tensor::from_vec(out, x.dims(), x.device())
+}
+
+/// Exact (erf) GELU of every element.
+pub fn gelu(x: &Tensor) -> Result<Tensor> {
+    match covered([x]) {
+        true => map(x, Function::Gelu),
+        false => x.gelu_erf(),
+    }
+}
+
+/// `x * sigmoid(x)` of every element.
+pub fn silu(x: &Tensor) -> Result<Tensor> {
+    match covered([x]) {
+        true => map(x, Function::Silu),
+        false => x.silu(),
+    }
+}
+
+fn map(x: &Tensor, function: Function) -> Result<Tensor> {
+    let mut out = vec![0f32; x.elem_count()];
+    with_values(x, |values| {
+        kernels::rows::map(Isa::detect(), function, values, &mut out);
+        Ok(())
+    })?;
+    Tensor::from_vec(out, x.dims(), x.device())
+}
+
+/// `softmax(x / tau)` over the last axis (motion weights: paper section 3.2, `tau` 0.5).
+pub fn softmax(x: &Tensor, tau: f64) -> Result<Tensor> {
+    let width = x.dim(D::Minus1)?;
+    if x.elem_count() == 0 || !covered([x]) {
+        return plain::softmax(x, tau);
+    }
+    let mut out = vec![0f32; x.elem_count()];
+    with_values(x, |values| {
+        kernels::rows::softmax(Isa::detect(), values, width, tau as f32, &mut out);
+        Ok(())
+    })?;
+    Tensor::from_vec(out, x.dims(), x.device())
 }

@@ -60,3 +60,8 @@ pub fn layer_norm(x: &Tensor, weight: Option<&Tensor>, bias: Option<&Tensor>, ep
         None => Ok(y),
     }
 }
+
+/// `softmax(x / tau)` over the last axis.
+pub fn softmax(x: &Tensor, tau: f64) -> Result<Tensor> {
+    candle_nn::ops::softmax(&(x / tau)?, D::Minus1)
+}

@@ -1,1 +1,111 @@
-//! Fast CPU kernels behind candle: tiled attention, linear layers with fused epilogues, layer norm.
+//! Fast f32 CPU kernels behind the network's operations: tiled attention, linear layers with fused epilogues, layer
+//! norm, row softmax.
+//!
+//! One source, three compilations: every kernel is one generic body over [`simd::Simd`], compiled for AVX2+FMA, for
+//! AVX-512 and for the target's baseline, and picked at run time by [`Isa::detect`]. The AVX2 vectors are intrinsics;
+//! the other two are plain arrays the compiler turns into vectors.
+//!
+//! Every sum is taken in an order fixed by the shapes and the instruction set alone, so results have the same bits for
+//! any number of threads. Between instruction sets they differ by rounding.
+//!
+//! Forward only: [`crate::ops`] sends tensors that carry gradients to [`crate::plain`].
+
+mod aligned;
+pub mod attention;
+pub mod gemm;
+pub mod math;
+pub mod norm;
+pub mod peak;
+pub mod rows;
+mod simd;
+pub(crate) mod tensors;
+
+use std::sync::OnceLock;
+
+/// The instruction set a kernel is compiled for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Isa {
+    /// The target's baseline (SSE2 on x86-64, NEON on aarch64).
+    Portable,
+    /// x86-64 with AVX2 and FMA.
+    Avx2,
+    /// x86-64 with AVX-512F.
+    Avx512,
+}
+
+impl Isa {
+    /// The widest set this machine runs, looked up once.
+    pub fn detect() -> Self {
+        static FOUND: OnceLock<Isa> = OnceLock::new();
+        *FOUND.get_or_init(|| Self::available().last().copied().unwrap_or(Isa::Portable))
+    }
+
+    /// Every set this machine runs, narrowest first.
+    pub fn available() -> Vec<Self> {
+        #[allow(unused_mut)]
+        let mut sets = vec![Isa::Portable];
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            sets.push(Isa::Avx2);
+            if is_x86_feature_detected!("avx512f") {
+                sets.push(Isa::Avx512);
+            }
+        }
+        sets
+    }
+
+    /// Floats in one vector register.
+    pub(crate) fn lanes(self) -> usize {
+        match self {
+            Isa::Portable => 4,
+            Isa::Avx2 => 8,
+            Isa::Avx512 => 16,
+        }
+    }
+
+    /// Rows of a register tile: with two vectors a row they fill the register file, less two for the right-hand
+    /// side and one for the broadcast.
+    pub(crate) fn tile_rows(self) -> usize {
+        match self {
+            Isa::Portable | Isa::Avx2 => 6,
+            Isa::Avx512 => 12,
+        }
+    }
+
+    /// Columns of a register tile.
+    pub(crate) fn tile_cols(self) -> usize {
+        2 * self.lanes()
+    }
+
+    /// Depth of one packed right-hand panel: `depth x tile_cols` floats are 16 KiB, half of a small first-level cache.
+    pub(crate) fn panel_depth(self) -> usize {
+        (4096 / self.tile_cols()).min(256)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// Seeded values in `-scale..scale`.
+    pub(crate) fn noise(seed: u64, len: usize, scale: f32) -> Vec<f32> {
+        use rand::{RngExt, SeedableRng};
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        (0..len).map(|_| rng.random_range(-scale..scale)).collect()
+    }
+
+    /// Largest absolute difference, infinite for NaN.
+    pub(crate) fn worst_difference(got: &[f32], want: &[f64]) -> f64 {
+        assert_eq!(got.len(), want.len());
+        let differences = got.iter().zip(want).map(|(&g, &w)| (f64::from(g) - w).abs());
+        differences.fold(0.0, |a, d| if d <= a { a } else { if d.is_nan() { f64::INFINITY } else { d } })
+    }
+
+    #[test]
+    fn tiles_divide_the_blocks() {
+        for isa in [Isa::Portable, Isa::Avx2, Isa::Avx512] {
+            assert_eq!(96 % isa.tile_rows(), 0);
+            assert!(isa.panel_depth() * isa.tile_cols() <= 4096);
+        }
+    }
+}

@@ -1,0 +1,454 @@
+//! Self-attention without the `n x n` matrix: blocks of queries against blocks of keys with a running maximum and sum
+//! (Milakov and Gimelshein, "Online normalizer calculation for softmax", 2018; Dao et al., "FlashAttention", 2022).
+//!
+//! Keys and values are first packed per head into panels of one register tile's width. A task is one block of
+//! [`BLOCK_QUERIES`] queries of one head; for each block of [`BLOCK_KEYS`] keys it computes the logits in register
+//! tiles (in units of log 2, so that the softmax is a power of two), turns them into weights row by row, and adds the
+//! weighted values to its output block. All blocks of a task fit the second-level cache.
+//!
+//! Logits may be of any finite size: the largest so far is subtracted before the power is taken, so weights are at most
+//! 1 and the sum at least 1. A NaN in a query, key or value reaches every output
+//! that depends on it.
+
+use rayon::prelude::*;
+
+use super::Isa;
+use super::aligned::Aligned;
+use super::gemm::tile;
+use super::math::exp2;
+use super::simd::{Kernel, Simd, dispatch};
+
+/// Queries of a task: a multiple of both tile heights.
+const BLOCK_QUERIES: usize = 96;
+/// Keys taken at a time. The logits of a task are `96 x 256` floats, 96 KiB.
+const BLOCK_KEYS: usize = 256;
+
+/// The sizes of one call.
+#[derive(Debug, Clone, Copy)]
+pub struct Shape {
+    /// Independent sequences.
+    pub batch: usize,
+    /// Tokens of each.
+    pub tokens: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Channels of a head.
+    pub head_dim: usize,
+}
+
+impl Shape {
+    /// Channels of the result.
+    fn width(&self) -> usize {
+        self.heads * self.head_dim
+    }
+}
+
+/// How the packed keys and values of one block of keys lie in memory.
+#[derive(Clone, Copy)]
+struct Layout {
+    /// Floats of a register tile's row.
+    nr: usize,
+    /// `head_dim` rounded up to whole tiles.
+    value_dim: usize,
+    /// Floats of a block's keys; its values follow.
+    key_floats: usize,
+    /// Floats of a block.
+    block_floats: usize,
+    /// Blocks of a head.
+    blocks: usize,
+}
+
+impl Layout {
+    fn new(isa: Isa, shape: &Shape) -> Self {
+        let nr = isa.tile_cols();
+        let value_dim = shape.head_dim.next_multiple_of(nr);
+        let key_floats = BLOCK_KEYS * shape.head_dim;
+        let block_floats = (key_floats + BLOCK_KEYS * value_dim).next_multiple_of(16);
+        Self { nr, value_dim, key_floats, block_floats, blocks: shape.tokens.div_ceil(BLOCK_KEYS) }
+    }
+}
+
+/// Packs the keys `(panel, channel, key)` and values `(panel, key, channel)` of one block; `block` starts as zeros.
+fn pack(qkv: &[f32], shape: &Shape, layout: &Layout, index: usize, block: &mut [f32]) {
+    let (head_index, first) = (index / layout.blocks, index % layout.blocks * BLOCK_KEYS);
+    let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
+    let (d, width, nr) = (shape.head_dim, shape.width(), layout.nr);
+    let (keys, values) = block.split_at_mut(layout.key_floats);
+    for t in 0..BLOCK_KEYS.min(shape.tokens - first) {
+        let row = &qkv[(batch * shape.tokens + first + t) * 3 * width..][..3 * width];
+        let key = &row[width + head * d..][..d];
+        let panel = &mut keys[t / nr * d * nr..][..d * nr];
+        for (c, &x) in key.iter().enumerate() {
+            panel[c * nr + t % nr] = x;
+        }
+        let value = &row[2 * width + head * d..][..d];
+        for (p, part) in value.chunks(nr).enumerate() {
+            values[(p * BLOCK_KEYS + t) * nr..][..part.len()].copy_from_slice(part);
+        }
+    }
+}
+
+/// Working memory of a task, kept by its thread.
+struct Scratch {
+    queries: Aligned,
+    weights: Aligned,
+    sums: Aligned,
+}
+
+impl Scratch {
+    fn new(shape: &Shape, layout: &Layout) -> Self {
+        Self {
+            queries: Aligned::zeroed(BLOCK_QUERIES * shape.head_dim),
+            weights: Aligned::zeroed(BLOCK_QUERIES * BLOCK_KEYS),
+            sums: Aligned::zeroed(BLOCK_QUERIES * layout.value_dim),
+        }
+    }
+}
+
+/// The result, written by tasks that own disjoint rows and columns of it.
+#[derive(Clone, Copy)]
+struct Output {
+    start: *mut f32,
+    len: usize,
+}
+
+// SAFETY: every task writes other elements (see `Output::row`), and the buffer outlives the parallel loop.
+unsafe impl Send for Output {}
+// SAFETY: as above.
+unsafe impl Sync for Output {}
+
+impl Output {
+    /// # Safety
+    /// No other task may hold any of `at..at + len`.
+    #[allow(clippy::mut_from_ref)]
+    unsafe fn row(&self, at: usize, len: usize) -> &mut [f32] {
+        assert!(at + len <= self.len);
+        // SAFETY: in bounds by the assertion, not shared by the caller's contract.
+        unsafe { std::slice::from_raw_parts_mut(self.start.add(at), len) }
+    }
+}
+
+/// One block of queries of one head.
+#[derive(Clone, Copy)]
+struct Source<'a> {
+    qkv: &'a [f32],
+    shape: &'a Shape,
+    batch: usize,
+    head: usize,
+    first: usize,
+}
+
+/// What is done with it.
+struct Task<'a> {
+    source: Source<'a>,
+    layout: &'a Layout,
+    /// Packed blocks of this head.
+    blocks: &'a [f32],
+    scratch: &'a mut Scratch,
+    out: Output,
+}
+
+impl Source<'_> {
+    /// Row panels of `MR` queries, scaled; rows past the end are zeros.
+    #[inline(always)]
+    fn pack_queries<const MR: usize>(&self, packed: &mut [f32], queries: usize) {
+        let (d, width) = (self.shape.head_dim, self.shape.width());
+        let scale = std::f32::consts::LOG2_E / (d as f32).sqrt();
+        packed.fill(0.0);
+        for r in 0..queries {
+            let row = (self.batch * self.shape.tokens + self.first + r) * 3 * width + self.head * d;
+            let panel = &mut packed[r / MR * d * MR..][..d * MR];
+            for (c, &x) in self.qkv[row..row + d].iter().enumerate() {
+                panel[c * MR + r % MR] = x * scale;
+            }
+        }
+    }
+}
+
+impl Kernel for Task<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<S: Simd, const MR: usize>(self) {
+        let Source { shape, batch, head, first, .. } = self.source;
+        let layout = self.layout;
+        let (d, nr) = (shape.head_dim, 2 * S::W);
+        let queries = BLOCK_QUERIES.min(shape.tokens - first);
+        let panels = queries.div_ceil(MR);
+        let Scratch { queries: packed, weights, sums } = self.scratch;
+        let (q, weights, sums) = (packed.as_mut_slice(), weights.as_mut_slice(), sums.as_mut_slice());
+        self.source.pack_queries::<MR>(q, queries);
+        sums.fill(0.0);
+        let mut largest = [f32::MIN; BLOCK_QUERIES];
+        let mut total = [0f32; BLOCK_QUERIES];
+        let mut shrink = [0f32; BLOCK_QUERIES];
+
+        for (index, block) in self.blocks.chunks_exact(layout.block_floats).enumerate() {
+            let count = BLOCK_KEYS.min(shape.tokens - index * BLOCK_KEYS);
+            let key_panels = count.div_ceil(nr);
+            let (keys, values) = block.split_at(layout.key_floats);
+
+            for j in 0..key_panels {
+                let b = &keys[j * d * nr..][..d * nr];
+                for i in 0..panels {
+                    let a = &q[i * d * MR..][..d * MR];
+                    let to = &mut weights[i * MR * BLOCK_KEYS..][..MR * BLOCK_KEYS];
+                    // SAFETY: `a` has `d` columns of MR, `b` `d` rows of two vectors; `to` MR rows of BLOCK_KEYS, of
+                    // which panel `j < key_panels` is inside.
+                    unsafe {
+                        let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [[S::zero(); 2]; MR]);
+                        for r in 0..MR {
+                            let row = to.as_mut_ptr().add(r * BLOCK_KEYS + j * nr);
+                            S::store(row, acc[r][0]);
+                            S::store(row.add(S::W), acc[r][1]);
+                        }
+                    }
+                }
+            }
+
+            for r in 0..panels * MR {
+                let row = &mut weights[r * BLOCK_KEYS..][..key_panels * nr];
+                row[count..].fill(f32::MIN);
+                shrink[r] = largest[r];
+                largest[r] = row_largest::<S>(row, largest[r]);
+            }
+            shrink_sums::<S>(&mut shrink, &largest, &mut total);
+            for r in 0..panels * MR {
+                let row = &mut weights[r * BLOCK_KEYS..][..key_panels * nr];
+                total[r] += row_weights::<S>(row, largest[r]);
+            }
+
+            for c in 0..layout.value_dim / nr {
+                let b = &values[c * BLOCK_KEYS * nr..][..count * nr];
+                for i in 0..panels {
+                    let a = &weights[i * MR * BLOCK_KEYS..][..MR * BLOCK_KEYS];
+                    let to = &mut sums[(c * BLOCK_QUERIES + i * MR) * nr..][..MR * nr];
+                    // SAFETY: `a` has MR rows of BLOCK_KEYS >= count, `b` `count` rows of two vectors, `to` MR such rows.
+                    unsafe {
+                        let mut acc = [[S::zero(); 2]; MR];
+                        for r in 0..MR {
+                            let keep = S::splat(shrink[i * MR + r]);
+                            acc[r][0] = S::mul(keep, S::load(to.as_ptr().add(r * nr)));
+                            acc[r][1] = S::mul(keep, S::load(to.as_ptr().add(r * nr + S::W)));
+                        }
+                        let acc = tile::<S, MR>(count, a.as_ptr(), 1, BLOCK_KEYS, b.as_ptr(), acc);
+                        for r in 0..MR {
+                            S::store(to.as_mut_ptr().add(r * nr), acc[r][0]);
+                            S::store(to.as_mut_ptr().add(r * nr + S::W), acc[r][1]);
+                        }
+                    }
+                }
+            }
+        }
+
+        for r in 0..queries {
+            let at = (batch * shape.tokens + first + r) * shape.width() + head * d;
+            // SAFETY: batch, head and query block identify the task, so no other task writes these columns of this row.
+            let row = unsafe { self.out.row(at, d) };
+            let scale = 1.0 / total[r];
+            for (c, part) in row.chunks_mut(nr).enumerate() {
+                let from = &sums[(c * BLOCK_QUERIES + r) * nr..][..part.len()];
+                part.iter_mut().zip(from).for_each(|(o, s)| *o = s * scale);
+            }
+        }
+    }
+}
+
+/// The largest of `before` and the row's logits (NaN is passed over: its weight will be NaN).
+#[inline(always)]
+fn row_largest<S: Simd>(row: &[f32], before: f32) -> f32 {
+    let mut tops = [S::splat(before); 2];
+    for two in row.chunks_exact(2 * S::W) {
+        // SAFETY: the chunk has two vectors.
+        unsafe {
+            tops[0] = S::max_of(S::load(two.as_ptr()), tops[0]);
+            tops[1] = S::max_of(S::load(two.as_ptr().add(S::W)), tops[1]);
+        }
+    }
+    S::largest(S::max_of(tops[0], tops[1]))
+}
+
+/// `shrink` holds the largest logits before this block; turns them into `2^(before - largest)` and scales the totals.
+#[inline(always)]
+fn shrink_sums<S: Simd>(
+    shrink: &mut [f32; BLOCK_QUERIES],
+    largest: &[f32; BLOCK_QUERIES],
+    total: &mut [f32; BLOCK_QUERIES],
+) {
+    for at in (0..BLOCK_QUERIES).step_by(S::W) {
+        // SAFETY: BLOCK_QUERIES is a multiple of every vector's width.
+        unsafe {
+            let before = S::load(shrink.as_ptr().add(at));
+            let factor = exp2::<S>(S::sub(before, S::load(largest.as_ptr().add(at))));
+            S::store(shrink.as_mut_ptr().add(at), factor);
+            S::store(total.as_mut_ptr().add(at), S::mul(factor, S::load(total.as_ptr().add(at))));
+        }
+    }
+}
+
+/// Weights `2^(x - top)` in place of the logits; returns their sum.
+#[inline(always)]
+fn row_weights<S: Simd>(row: &mut [f32], top: f32) -> f32 {
+    let subtract = S::splat(top);
+    let mut sum = S::zero();
+    // One vector at a time: two would push the polynomial's constants out of the registers.
+    for one in row.chunks_exact_mut(S::W) {
+        // SAFETY: the chunk has one vector.
+        unsafe {
+            let w = exp2::<S>(S::sub(S::load(one.as_ptr()), subtract));
+            sum = S::add(sum, w);
+            S::store(one.as_mut_ptr(), w);
+        }
+    }
+    S::sum(sum)
+}
+
+/// `softmax(q k^T / sqrt(head_dim)) v` for `qkv` `(batch, tokens, 3 * heads * head_dim)` with rows `[q | k | v]`; `out` is
+/// `(batch, tokens, heads * head_dim)`.
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes).
+pub fn attention(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) {
+    let rows = shape.batch * shape.tokens;
+    assert_eq!(qkv.len(), rows * 3 * shape.width(), "qkv of {shape:?}");
+    assert_eq!(out.len(), rows * shape.width(), "output of {shape:?}");
+    if out.is_empty() {
+        return;
+    }
+    let layout = Layout::new(isa, &shape);
+    let head_floats = layout.blocks * layout.block_floats;
+    let mut packed = Aligned::zeroed(shape.batch * shape.heads * head_floats);
+    packed.as_mut_slice().par_chunks_exact_mut(layout.block_floats).enumerate().for_each(|(index, block)| {
+        pack(qkv, &shape, &layout, index, block);
+    });
+    let packed = packed.as_slice();
+    let query_blocks = shape.tokens.div_ceil(BLOCK_QUERIES);
+    let output = Output { start: out.as_mut_ptr(), len: out.len() };
+    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each_init(
+        || Scratch::new(&shape, &layout),
+        |scratch, index| {
+            let (head_index, query_block) = (index / query_blocks, index % query_blocks);
+            let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
+            let source = Source { qkv, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
+            let blocks = &packed[head_index * head_floats..][..head_floats];
+            dispatch(isa, Task { source, layout: &layout, blocks, scratch, out: output });
+        },
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::tests::{noise, worst_difference};
+
+    /// For values up to 1: the weights' own rounding, and that of logits of a few units.
+    const TOLERANCE: f64 = 2e-6;
+    /// Logits of 1e4 carry a rounding of up to 1e-3 each, and weights follow it.
+    const BIG_LOGITS_TOLERANCE: f64 = 2e-2;
+
+    fn reference(qkv: &[f32], s: Shape) -> Vec<f64> {
+        let (d, width) = (s.head_dim, s.width());
+        let at = |b: usize, t: usize, part: usize, h: usize, c: usize| -> f64 {
+            qkv[(b * s.tokens + t) * 3 * width + part * width + h * d + c].into()
+        };
+        let mut out = vec![0f64; s.batch * s.tokens * width];
+        for b in 0..s.batch {
+            for h in 0..s.heads {
+                for t in 0..s.tokens {
+                    let logits: Vec<f64> = (0..s.tokens)
+                        .map(|u| (0..d).map(|c| at(b, t, 0, h, c) * at(b, u, 1, h, c)).sum::<f64>() / (d as f64).sqrt())
+                        .collect();
+                    let top = logits.iter().fold(f64::NEG_INFINITY, |a, &l| a.max(l));
+                    let weights: Vec<f64> = logits.iter().map(|l| (l - top).exp()).collect();
+                    let total: f64 = weights.iter().sum();
+                    for c in 0..d {
+                        let sum: f64 = weights.iter().enumerate().map(|(u, w)| w * at(b, u, 2, h, c)).sum();
+                        out[(b * s.tokens + t) * width + h * d + c] = sum / total;
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    fn shapes() -> Vec<Shape> {
+        let list = [
+            (1, 1, 1, 1),
+            (1, 2, 3, 8),
+            (2, 20, 4, 16),
+            (1, 97, 1, 64),
+            (1, 255, 2, 24),
+            (1, 256, 1, 33),
+            (2, 259, 2, 7),
+            (1, 700, 1, 72),
+        ];
+        list.iter().map(|&(batch, tokens, heads, head_dim)| Shape { batch, tokens, heads, head_dim }).collect()
+    }
+
+    #[test]
+    fn every_shape() {
+        for isa in Isa::available() {
+            for (i, s) in shapes().into_iter().enumerate() {
+                let mut qkv = noise(i as u64, s.batch * s.tokens * 3 * s.width(), 1.0);
+                // Some structure, so that weights are not all alike.
+                qkv.iter_mut().step_by(7).for_each(|x| *x *= 3.0);
+                let mut out = vec![f32::NAN; s.batch * s.tokens * s.width()];
+                attention(isa, &qkv, s, &mut out);
+                let worst = worst_difference(&out, &reference(&qkv, s));
+                assert!(worst < TOLERANCE, "{isa:?} {s:?}: {worst:e}");
+            }
+        }
+    }
+
+    #[test]
+    fn logits_of_ten_thousand_stay_finite() {
+        let s = Shape { batch: 1, tokens: 300, heads: 2, head_dim: 16 };
+        let mut qkv = noise(5, s.tokens * 3 * s.width(), 1.0);
+        for row in qkv.chunks_exact_mut(3 * s.width()) {
+            row[..2 * s.width()].iter_mut().for_each(|x| *x *= 100.0);
+        }
+        for isa in Isa::available() {
+            let mut out = vec![f32::NAN; s.tokens * s.width()];
+            attention(isa, &qkv, s, &mut out);
+            assert!(out.iter().all(|x| x.is_finite() && x.abs() <= 1.0001));
+            let worst = worst_difference(&out, &reference(&qkv, s));
+            assert!(worst < BIG_LOGITS_TOLERANCE, "{isa:?}: {worst:e}");
+        }
+    }
+
+    #[test]
+    fn nan_reaches_its_outputs_only() {
+        let s = Shape { batch: 1, tokens: 40, heads: 2, head_dim: 8 };
+        let mut qkv = noise(6, s.tokens * 3 * s.width(), 1.0);
+        qkv[17 * 3 * s.width() + 3] = f32::NAN;
+        for isa in Isa::available() {
+            let mut out = vec![0.0; s.tokens * s.width()];
+            attention(isa, &qkv, s, &mut out);
+            for (i, x) in out.iter().enumerate() {
+                assert_eq!(x.is_nan(), i / s.width() == 17 && i % s.width() < 8, "element {i}");
+            }
+            let mut poisoned = qkv.clone();
+            poisoned[20 * 3 * s.width() + s.width() + 9] = f32::NAN;
+            attention(isa, &poisoned, s, &mut out);
+            assert!(
+                out.chunks_exact(s.width()).all(|row| row[8..].iter().all(|x| x.is_nan())),
+                "a key reaches all rows"
+            );
+        }
+    }
+
+    #[test]
+    fn same_bits_for_any_thread_count() {
+        let s = Shape { batch: 2, tokens: 333, heads: 3, head_dim: 20 };
+        let qkv = noise(7, s.batch * s.tokens * 3 * s.width(), 2.0);
+        let run = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut out = vec![0.0; s.batch * s.tokens * s.width()];
+            pool.install(|| attention(Isa::detect(), &qkv, s, &mut out));
+            out
+        };
+        let one = run(1);
+        for threads in [2, 3, 8] {
+            assert!(one.iter().zip(&run(threads)).all(|(a, b)| a.to_bits() == b.to_bits()), "{threads} threads");
+        }
+    }
+}

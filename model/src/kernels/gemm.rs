@@ -1,0 +1,386 @@
+//! Linear layers: `act(x w^T + bias) + residual`, cache-blocked around one register tile.
+//!
+//! Blocking, from the inside out (the usual one, after Goto and van de Geijn, "Anatomy of High-Performance Matrix
+//! Multiplication", 2008): a tile of `tile_rows x tile_cols` accumulators stays in registers over `panel_depth`
+//! products; its right-hand panel (16 KiB) stays in the first-level cache while all row panels of the block pass by;
+//! the block of `x` (at most [`BLOCK_ROWS`] rows) is packed once and stays in the second level; partial sums wait in a
+//! block [`BLOCK_COLS`] wide. Weights are packed once per layer ([`PackedWeight`]).
+//!
+//! Every output is summed in the order of `k`, in blocks fixed by `k` alone: neither the split over threads nor the
+//! row's place in `x` changes its bits.
+
+use std::cell::RefCell;
+
+use rayon::prelude::*;
+
+use super::Isa;
+use super::aligned::Aligned;
+use super::math::activate;
+use super::simd::{Kernel, Simd, dispatch};
+use crate::ops::Activation;
+
+/// Rows of `x` a task works on at most: a multiple of both tile heights.
+const BLOCK_ROWS: usize = 96;
+/// Columns of partial sums kept at a time (`96 x 512` floats are 192 KiB).
+const BLOCK_COLS: usize = 512;
+/// Tasks per thread that keep threads busy to the end.
+const TASKS_PER_THREAD: usize = 4;
+
+/// `acc + a b` over `depth` products: `a[p * a_step + r * a_row]` for row `r`, `b` a packed panel of two vectors a row.
+///
+/// # Safety
+/// `a` must be readable at those indices for `p < depth`, `r < MR`; `b` for `depth * 2 * W` floats.
+#[inline(always)]
+pub(crate) unsafe fn tile<S: Simd, const MR: usize>(
+    depth: usize,
+    a: *const f32,
+    a_step: usize,
+    a_row: usize,
+    b: *const f32,
+    mut acc: [[S::V; 2]; MR],
+) -> [[S::V; 2]; MR] {
+    let (mut a, mut b) = (a, b);
+    for _ in 0..depth {
+        // SAFETY: the caller's contract; the pointers advance once per product.
+        unsafe {
+            let (b0, b1) = (S::load(b), S::load(b.add(S::W)));
+            for r in 0..MR {
+                let x = S::splat(*a.add(r * a_row));
+                acc[r][0] = S::mul_add(x, b0, acc[r][0]);
+                acc[r][1] = S::mul_add(x, b1, acc[r][1]);
+            }
+            a = a.add(a_step);
+            b = b.add(2 * S::W);
+        }
+    }
+    acc
+}
+
+/// Equal-sized slices of the summed dimension, none deeper than the panel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Depths {
+    k: usize,
+    step: usize,
+}
+
+impl Depths {
+    fn new(isa: Isa, k: usize) -> Self {
+        Self { k, step: k.div_ceil(k.div_ceil(isa.panel_depth())) }
+    }
+
+    fn ranges(self) -> impl Iterator<Item = (usize, usize)> {
+        (0..self.k).step_by(self.step).map(move |at| (at, self.step.min(self.k - at)))
+    }
+}
+
+/// A weight `(n, k)` laid out as the kernel reads it: per panel of `tile_cols` outputs, `k` rows of that many floats,
+/// zeros past `n`.
+#[derive(Debug)]
+pub struct PackedWeight {
+    isa: Isa,
+    n: usize,
+    k: usize,
+    data: Aligned,
+}
+
+impl PackedWeight {
+    /// Packs a row-major `(n, k)` weight, `k > 0`.
+    pub fn new(isa: Isa, weight: &[f32], n: usize, k: usize) -> Self {
+        assert!(k > 0 && weight.len() == n * k, "weight of {n} x {k}");
+        let nr = isa.tile_cols();
+        let mut data = Aligned::zeroed(n.div_ceil(nr) * nr * k);
+        data.as_mut_slice().par_chunks_mut(nr * k).zip(weight.par_chunks(nr * k)).for_each(|(panel, rows)| {
+            for (j, row) in rows.chunks_exact(k).enumerate() {
+                for (p, &w) in row.iter().enumerate() {
+                    panel[p * nr + j] = w;
+                }
+            }
+        });
+        Self { isa, n, k, data }
+    }
+
+    /// Outputs of the layer.
+    pub fn outputs(&self) -> usize {
+        self.n
+    }
+
+    /// Inputs of the layer.
+    pub fn inputs(&self) -> usize {
+        self.k
+    }
+}
+
+/// What happens to a finished sum.
+#[derive(Debug, Clone, Copy)]
+pub struct Epilogue<'a> {
+    /// Added to each row first, `(n)`.
+    pub bias: Option<&'a [f32]>,
+    /// Then applied.
+    pub act: Activation,
+    /// Added last, `(m, n)`.
+    pub residual: Option<&'a [f32]>,
+}
+
+/// Working memory of a thread: packed rows of `x` and partial sums. Kept, because clearing it anew for every block costs
+/// as much as a few percent of the products.
+#[derive(Default)]
+struct Scratch {
+    packed: Aligned,
+    partial: Aligned,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// One task: some rows of the output.
+struct Block<'a> {
+    scratch: &'a mut Scratch,
+    x: &'a [f32],
+    w: &'a PackedWeight,
+    bias: Option<&'a [f32]>,
+    act: Activation,
+    residual: Option<&'a [f32]>,
+    out: &'a mut [f32],
+}
+
+/// Row panels of `MR`, each `k` columns of `MR` floats; rows past the end are zeros.
+#[inline(always)]
+fn pack_rows<const MR: usize>(x: &[f32], k: usize, packed: &mut [f32]) {
+    for (panel, rows) in packed.chunks_exact_mut(MR * k).zip(x.chunks(MR * k)) {
+        if rows.len() == MR * k {
+            let rows: [&[f32]; MR] = std::array::from_fn(|r| &rows[r * k..(r + 1) * k]);
+            for (p, column) in panel.chunks_exact_mut(MR).enumerate() {
+                for r in 0..MR {
+                    column[r] = rows[r][p];
+                }
+            }
+        } else {
+            panel.fill(0.0);
+            for (r, row) in rows.chunks_exact(k).enumerate() {
+                for (p, &v) in row.iter().enumerate() {
+                    panel[p * MR + r] = v;
+                }
+            }
+        }
+    }
+}
+
+impl Kernel for Block<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<S: Simd, const MR: usize>(self) {
+        let (n, k) = (self.w.n, self.w.k);
+        let nr = 2 * S::W;
+        let m = self.out.len() / n;
+        let row_panels = m.div_ceil(MR);
+        let packed = self.scratch.packed.at_least(row_panels * MR * k);
+        pack_rows::<MR>(self.x, k, packed);
+        let weights = self.w.data.as_slice();
+        let block_panels = BLOCK_COLS / nr;
+        let partial = self.scratch.partial.at_least(row_panels * MR * n.div_ceil(nr).min(block_panels) * nr);
+        let depths = Depths::new(self.w.isa, k);
+
+        let col_panels = n.div_ceil(nr);
+        for first_panel in (0..col_panels).step_by(block_panels) {
+            let panels = block_panels.min(col_panels - first_panel);
+            for (at, depth) in depths.ranges() {
+                let last = at + depth == k;
+                for j in 0..panels {
+                    let b = &weights[((first_panel + j) * k + at) * nr..][..depth * nr];
+                    for i in 0..row_panels {
+                        let a = &packed[(i * k + at) * MR..][..depth * MR];
+                        let sums = &mut partial[(j * row_panels + i) * MR * nr..][..MR * nr];
+                        let mut acc = [[S::zero(); 2]; MR];
+                        // SAFETY: `sums` has MR rows of two vectors; `a` has `depth * MR`, `b` `depth * 2 W` floats.
+                        unsafe {
+                            if at > 0 {
+                                for r in 0..MR {
+                                    acc[r][0] = S::load(sums.as_ptr().add(r * nr));
+                                    acc[r][1] = S::load(sums.as_ptr().add(r * nr + S::W));
+                                }
+                            }
+                            acc = tile::<S, MR>(depth, a.as_ptr(), MR, 1, b.as_ptr(), acc);
+                            for r in 0..MR {
+                                S::store(sums.as_mut_ptr().add(r * nr), acc[r][0]);
+                                S::store(sums.as_mut_ptr().add(r * nr + S::W), acc[r][1]);
+                            }
+                        }
+                        if last {
+                            let rows = MR.min(m - i * MR);
+                            for r in 0..rows {
+                                let (row, col) = (i * MR + r, (first_panel + j) * nr);
+                                let width = nr.min(n - col);
+                                let place = row * n + col..row * n + col + width;
+                                finish::<S>(
+                                    &mut sums[r * nr..(r + 1) * nr],
+                                    self.bias.map(|b| &b[col..col + width]),
+                                    self.act,
+                                    self.residual.map(|x| &x[place.clone()]),
+                                    &mut self.out[place],
+                                );
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The epilogue on one tile row: `sums` has two whole vectors, the others as many columns as there are outputs.
+#[inline(always)]
+fn finish<S: Simd>(sums: &mut [f32], bias: Option<&[f32]>, act: Activation, residual: Option<&[f32]>, out: &mut [f32]) {
+    if out.len() == 2 * S::W && sums.len() == out.len() {
+        for at in [0, S::W] {
+            // SAFETY: all four have two vectors' worth of floats.
+            unsafe {
+                let mut v = S::load(sums.as_ptr().add(at));
+                if let Some(bias) = bias {
+                    v = S::add(v, S::load(bias.as_ptr().add(at)));
+                }
+                v = activate::<S>(act, v);
+                if let Some(residual) = residual {
+                    v = S::add(v, S::load(residual.as_ptr().add(at)));
+                }
+                S::store(out.as_mut_ptr().add(at), v);
+            }
+        }
+        return;
+    }
+    if let Some(bias) = bias {
+        sums.iter_mut().zip(bias).for_each(|(s, b)| *s += b);
+    }
+    for half in sums.chunks_exact_mut(S::W) {
+        // SAFETY: each half is one vector.
+        unsafe { S::store(half.as_mut_ptr(), activate::<S>(act, S::load(half.as_ptr()))) };
+    }
+    if let Some(residual) = residual {
+        sums.iter_mut().zip(residual).for_each(|(s, r)| *s += r);
+    }
+    let width = out.len();
+    out.copy_from_slice(&sums[..width]);
+}
+
+/// `out = act(x w^T + bias) + residual` for row-major `x` `(m, k)` and `out` `(m, n)`.
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes).
+pub fn linear(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, out: &mut [f32]) {
+    let (n, k) = (w.n, w.k);
+    if n == 0 || out.is_empty() {
+        return;
+    }
+    let m = out.len() / n;
+    assert_eq!(out.len(), m * n, "output of {m} x {n}");
+    assert_eq!(x.len(), m * k, "input of {m} x {k}");
+    if let Some(bias) = epilogue.bias {
+        assert_eq!(bias.len(), n, "bias of {n}");
+    }
+    if let Some(residual) = epilogue.residual {
+        assert_eq!(residual.len(), m * n, "residual of {m} x {n}");
+    }
+    let mr = w.isa.tile_rows();
+    let share = m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(mr);
+    let rows = share.min(BLOCK_ROWS);
+    out.par_chunks_mut(rows * n).enumerate().for_each(|(i, out)| {
+        let first = i * rows;
+        let count = out.len() / n;
+        let residual = epilogue.residual.map(|r| &r[first * n..(first + count) * n]);
+        let x = &x[first * k..(first + count) * k];
+        // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
+        SCRATCH.with_borrow_mut(|scratch| {
+            dispatch(w.isa, Block { scratch, x, w, bias: epilogue.bias, act: epilogue.act, residual, out });
+        });
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::tests::{noise, worst_difference};
+
+    /// Relative to `sum |x w|`: the rounding of a sum of up to 256 products in a row, then of the blocks.
+    const GEMM_RELATIVE: f64 = 2e-6;
+
+    /// Obvious f64 version; also gives the size of the sums.
+    fn reference(x: &[f32], w: &[f32], m: usize, n: usize, k: usize, e: Epilogue<'_>) -> Vec<f64> {
+        let mut out = vec![0f64; m * n];
+        for i in 0..m {
+            for j in 0..n {
+                let mut s: f64 = (0..k).map(|p| f64::from(x[i * k + p]) * f64::from(w[j * k + p])).sum();
+                s += e.bias.map_or(0.0, |b| b[j].into());
+                s = match e.act {
+                    Activation::None => s,
+                    Activation::Gelu => 0.5 * s * (1.0 + candle_core::cpu::erf::erf_f64(s / 2f64.sqrt())),
+                    Activation::Silu => s / (1.0 + (-s).exp()),
+                };
+                out[i * n + j] = s + e.residual.map_or(0.0, |r| r[i * n + j].into());
+            }
+        }
+        out
+    }
+
+    #[test]
+    fn every_shape_and_epilogue() {
+        let shapes = [
+            (1, 1, 1),
+            (1, 17, 3),
+            (5, 16, 8),
+            (6, 33, 257),
+            (7, 31, 513),
+            (97, 50, 64),
+            (200, 530, 19),
+            (13, 48, 1030),
+        ];
+        for isa in Isa::available() {
+            for (s, &(m, n, k)) in shapes.iter().enumerate() {
+                let scale = 1.0 / (k as f32).sqrt();
+                let x = noise(s as u64, m * k, 1.0);
+                let w = noise(s as u64 + 100, n * k, scale);
+                let bias = noise(s as u64 + 200, n, 0.5);
+                let residual = noise(s as u64 + 300, m * n, 1.0);
+                let packed = PackedWeight::new(isa, &w, n, k);
+                for act in [Activation::None, Activation::Gelu, Activation::Silu] {
+                    for (bias, residual) in [(None, None), (Some(&bias[..]), Some(&residual[..]))] {
+                        let e = Epilogue { bias, act, residual };
+                        let mut out = vec![f32::NAN; m * n];
+                        linear(&x, &packed, e, &mut out);
+                        let worst = worst_difference(&out, &reference(&x, &w, m, n, k, e));
+                        assert!(worst < GEMM_RELATIVE, "{isa:?} {m}x{n}x{k} {act:?}: {worst:e}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn same_bits_for_any_thread_count() {
+        let (m, n, k) = (331, 70, 300);
+        let x = noise(1, m * k, 1.0);
+        let packed = PackedWeight::new(Isa::detect(), &noise(2, n * k, 0.1), n, k);
+        let run = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut out = vec![0.0; m * n];
+            let e = Epilogue { bias: None, act: Activation::Gelu, residual: None };
+            pool.install(|| linear(&x, &packed, e, &mut out));
+            out
+        };
+        let one = run(1);
+        for threads in [2, 3, 8] {
+            assert!(one.iter().zip(&run(threads)).all(|(a, b)| a.to_bits() == b.to_bits()), "{threads} threads");
+        }
+    }
+
+    #[test]
+    fn nan_is_not_lost() {
+        let packed = PackedWeight::new(Isa::detect(), &noise(2, 20 * 9, 1.0), 20, 9);
+        let mut x = noise(1, 8 * 9, 1.0);
+        x[4 * 9 + 3] = f32::NAN;
+        let mut out = vec![0.0; 8 * 20];
+        linear(&x, &packed, Epilogue { bias: None, act: Activation::Gelu, residual: None }, &mut out);
+        for (i, v) in out.iter().enumerate() {
+            assert_eq!(v.is_nan(), i / 20 == 4, "row {}", i / 20);
+        }
+    }
+}

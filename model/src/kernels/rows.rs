@@ -1,0 +1,100 @@
+//! Element-wise functions and row softmax over large slices, in parallel.
+
+use rayon::prelude::*;
+
+use super::Isa;
+use super::math::{Function, apply, exp2};
+use super::simd::{Kernel, Simd, dispatch};
+
+/// Elements a task works on at least.
+const TASK_FLOATS: usize = 16 * 1024;
+
+/// `out = f(x)`, element by element.
+pub fn map(isa: Isa, function: Function, x: &[f32], out: &mut [f32]) {
+    assert_eq!(x.len(), out.len());
+    out.par_chunks_mut(TASK_FLOATS).zip(x.par_chunks(TASK_FLOATS)).for_each(|(out, x)| {
+        out.copy_from_slice(x);
+        apply(isa, function, out);
+    });
+}
+
+struct Softmax<'a> {
+    x: &'a [f32],
+    width: usize,
+    scale: f32,
+    out: &'a mut [f32],
+}
+
+impl Kernel for Softmax<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<S: Simd, const MR: usize>(self) {
+        let scale = S::splat(self.scale);
+        for (x, out) in self.x.chunks_exact(self.width).zip(self.out.chunks_exact_mut(self.width)) {
+            let top = x.iter().fold(f32::MIN, |a, &b| if b > a { b } else { a });
+            let top_vector = S::splat(top);
+            let mut total = 0f32;
+            for (x, out) in x.chunks(S::W).zip(out.chunks_mut(S::W)) {
+                let mut lanes = [f32::MIN; 16];
+                lanes[..x.len()].copy_from_slice(x);
+                // SAFETY: no vector has more than 16 lanes.
+                unsafe {
+                    let v = S::sub(S::load(lanes.as_ptr()), top_vector);
+                    S::store(lanes.as_mut_ptr(), exp2::<S>(S::mul(v, scale)));
+                }
+                out.copy_from_slice(&lanes[..out.len()]);
+                total += out.iter().sum::<f32>();
+            }
+            let inverse = 1.0 / total;
+            out.iter_mut().for_each(|o| *o *= inverse);
+        }
+    }
+}
+
+/// `softmax(x / tau)` over each row of `width` values (`tau > 0`).
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes).
+pub fn softmax(isa: Isa, x: &[f32], width: usize, tau: f32, out: &mut [f32]) {
+    if width == 0 {
+        return;
+    }
+    assert!(x.len() == out.len() && x.len().is_multiple_of(width), "rows of {width}");
+    let task = (TASK_FLOATS / width).max(1) * width;
+    let scale = std::f32::consts::LOG2_E / tau;
+    out.par_chunks_mut(task).zip(x.par_chunks(task)).for_each(|(out, x)| {
+        dispatch(isa, Softmax { x, width, scale, out });
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::tests::{noise, worst_difference};
+
+    /// Weights of at most 1: their own rounding and that of exponents up to a few tens.
+    const TOLERANCE: f64 = 1e-6;
+
+    #[test]
+    fn softmax_of_any_width() {
+        for isa in Isa::available() {
+            for width in [1, 3, 8, 16, 17, 100] {
+                let x = noise(width as u64, 50 * width, 6.0);
+                let mut out = vec![f32::NAN; x.len()];
+                softmax(isa, &x, width, 0.5, &mut out);
+                let mut want = Vec::new();
+                for row in x.chunks_exact(width) {
+                    let e: Vec<f64> = row.iter().map(|&v| (f64::from(v) / 0.5).exp()).collect();
+                    let total: f64 = e.iter().sum();
+                    want.extend(e.iter().map(|v| v / total));
+                }
+                assert!(worst_difference(&out, &want) < TOLERANCE, "{isa:?} {width}");
+            }
+            let mut out = [0.0; 3];
+            softmax(isa, &[1e30, -1e30, 1e30], 3, 0.5, &mut out);
+            assert_eq!(out, [0.5, f32::MIN_POSITIVE / 2.0, 0.5]);
+            softmax(isa, &[1.0, f32::NAN, 0.0], 3, 0.5, &mut out);
+            assert!(out.iter().all(|v| v.is_nan()));
+        }
+    }
+}

@@ -1,0 +1,258 @@
+//! Vectors of `f32` for kernels written once: a trait, its AVX2 and array versions, and the run-time choice.
+//!
+//! The vector types are private: kernels only ever see `S: Simd`, and only [`dispatch`] names an implementation, after
+//! the instruction set was detected. That is what makes the safe methods of the AVX2 version sound.
+
+use super::Isa;
+
+/// A vector of `W` floats. Every method is a few instructions and inlined into a function compiled for the set.
+pub(crate) trait Simd: Copy + 'static {
+    /// The register.
+    type V: Copy;
+    /// Floats in it.
+    const W: usize;
+
+    fn splat(x: f32) -> Self::V;
+    /// # Safety
+    /// `p` must be readable for `W` floats; no alignment is asked for.
+    unsafe fn load(p: *const f32) -> Self::V;
+    /// # Safety
+    /// `p` must be writable for `W` floats; no alignment is asked for.
+    unsafe fn store(p: *mut f32, v: Self::V);
+    fn add(a: Self::V, b: Self::V) -> Self::V;
+    fn sub(a: Self::V, b: Self::V) -> Self::V;
+    fn mul(a: Self::V, b: Self::V) -> Self::V;
+    fn div(a: Self::V, b: Self::V) -> Self::V;
+    /// `a * b + c`, rounded once where the set has FMA.
+    fn mul_add(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// The larger of `floor` and `x`; NaN in `x` stays NaN.
+    fn max_of(floor: Self::V, x: Self::V) -> Self::V;
+    fn abs(a: Self::V) -> Self::V;
+    /// Per lane: `a < b ? x : y` (false for NaN).
+    fn select_lt(a: Self::V, b: Self::V, x: Self::V, y: Self::V) -> Self::V;
+    /// `2^n` for `t = 1.5 * 2^23 + n`, `-126 <= n <= 127`, by shifting `n` into the exponent.
+    fn exponent(t: Self::V) -> Self::V;
+
+    fn zero() -> Self::V {
+        Self::splat(0.0)
+    }
+    /// Sum of the lanes, by halves.
+    #[inline(always)]
+    fn sum(v: Self::V) -> f32 {
+        let mut lanes = [0f32; 16];
+        // SAFETY: no vector has more than 16 lanes.
+        unsafe { Self::store(lanes.as_mut_ptr(), v) };
+        let mut half = Self::W / 2;
+        while half > 0 {
+            for i in 0..half {
+                lanes[i] += lanes[i + half];
+            }
+            half /= 2;
+        }
+        lanes[0]
+    }
+    /// Largest lane, for lanes that are not NaN.
+    #[inline(always)]
+    fn largest(v: Self::V) -> f32 {
+        let mut lanes = [0f32; 16];
+        // SAFETY: no vector has more than 16 lanes.
+        unsafe { Self::store(lanes.as_mut_ptr(), v) };
+        let mut half = Self::W / 2;
+        while half > 0 {
+            for i in 0..half {
+                lanes[i] = if lanes[i + half] > lanes[i] { lanes[i + half] } else { lanes[i] };
+            }
+            half /= 2;
+        }
+        lanes[0]
+    }
+}
+
+/// `W` floats in an array; the compiler finds the vectors. `FMA` only where the target has the instruction, else
+/// `mul_add` would be a library call.
+#[derive(Clone, Copy)]
+struct Lanes<const W: usize, const FMA: bool>;
+
+macro_rules! lanewise {
+    ($w:ident, |$i:ident| $e:expr) => {{
+        let mut out = [0f32; $w];
+        for $i in 0..$w {
+            out[$i] = $e;
+        }
+        out
+    }};
+}
+
+impl<const W: usize, const FMA: bool> Simd for Lanes<W, FMA> {
+    type V = [f32; W];
+    const W: usize = W;
+
+    #[inline(always)]
+    fn splat(x: f32) -> Self::V {
+        [x; W]
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const f32) -> Self::V {
+        // SAFETY: the caller gives `W` readable floats; the read asks for no alignment.
+        unsafe { p.cast::<[f32; W]>().read_unaligned() }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut f32, v: Self::V) {
+        // SAFETY: the caller gives `W` writable floats; the write asks for no alignment.
+        unsafe { p.cast::<[f32; W]>().write_unaligned(v) }
+    }
+    #[inline(always)]
+    fn add(a: Self::V, b: Self::V) -> Self::V {
+        lanewise!(W, |i| a[i] + b[i])
+    }
+    #[inline(always)]
+    fn sub(a: Self::V, b: Self::V) -> Self::V {
+        lanewise!(W, |i| a[i] - b[i])
+    }
+    #[inline(always)]
+    fn mul(a: Self::V, b: Self::V) -> Self::V {
+        lanewise!(W, |i| a[i] * b[i])
+    }
+    #[inline(always)]
+    fn div(a: Self::V, b: Self::V) -> Self::V {
+        lanewise!(W, |i| a[i] / b[i])
+    }
+    #[inline(always)]
+    fn mul_add(a: Self::V, b: Self::V, c: Self::V) -> Self::V {
+        if FMA { lanewise!(W, |i| a[i].mul_add(b[i], c[i])) } else { lanewise!(W, |i| a[i] * b[i] + c[i]) }
+    }
+    #[inline(always)]
+    fn max_of(floor: Self::V, x: Self::V) -> Self::V {
+        lanewise!(W, |i| if floor[i] > x[i] { floor[i] } else { x[i] })
+    }
+    #[inline(always)]
+    fn abs(a: Self::V) -> Self::V {
+        lanewise!(W, |i| a[i].abs())
+    }
+    #[inline(always)]
+    fn select_lt(a: Self::V, b: Self::V, x: Self::V, y: Self::V) -> Self::V {
+        lanewise!(W, |i| if a[i] < b[i] { x[i] } else { y[i] })
+    }
+    #[inline(always)]
+    fn exponent(t: Self::V) -> Self::V {
+        lanewise!(W, |i| f32::from_bits(t[i].to_bits().wrapping_add(127) << 23))
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod avx2 {
+    use std::arch::x86_64::*;
+
+    /// AVX2 and FMA registers.
+    #[derive(Clone, Copy)]
+    pub(super) struct Avx2;
+
+    // SAFETY (every block in this impl): the type is only named by `dispatch` under `Isa::Avx2`, which exists only
+    // after the features were detected, and every method is inlined into `run_avx2`.
+    impl super::Simd for Avx2 {
+        type V = __m256;
+        const W: usize = 8;
+
+        #[inline(always)]
+        fn splat(x: f32) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_set1_ps(x) }
+        }
+        #[inline(always)]
+        unsafe fn load(p: *const f32) -> __m256 {
+            // SAFETY: AVX2 was detected; the caller gives 8 readable floats.
+            unsafe { _mm256_loadu_ps(p) }
+        }
+        #[inline(always)]
+        unsafe fn store(p: *mut f32, v: __m256) {
+            // SAFETY: AVX2 was detected; the caller gives 8 writable floats.
+            unsafe { _mm256_storeu_ps(p, v) }
+        }
+        #[inline(always)]
+        fn add(a: __m256, b: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_add_ps(a, b) }
+        }
+        #[inline(always)]
+        fn sub(a: __m256, b: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_sub_ps(a, b) }
+        }
+        #[inline(always)]
+        fn mul(a: __m256, b: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_mul_ps(a, b) }
+        }
+        #[inline(always)]
+        fn div(a: __m256, b: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_div_ps(a, b) }
+        }
+        #[inline(always)]
+        fn mul_add(a: __m256, b: __m256, c: __m256) -> __m256 {
+            // SAFETY: FMA was detected (see the impl).
+            unsafe { _mm256_fmadd_ps(a, b, c) }
+        }
+        #[inline(always)]
+        fn max_of(floor: __m256, x: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected. maxps gives its second operand when either is NaN.
+            unsafe { _mm256_max_ps(floor, x) }
+        }
+        #[inline(always)]
+        fn abs(a: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), a) }
+        }
+        #[inline(always)]
+        fn select_lt(a: __m256, b: __m256, x: __m256, y: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_blendv_ps(y, x, _mm256_cmp_ps::<_CMP_LT_OQ>(a, b)) }
+        }
+        #[inline(always)]
+        fn exponent(t: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe {
+                let n = _mm256_add_epi32(_mm256_castps_si256(t), _mm256_set1_epi32(127));
+                _mm256_castsi256_ps(_mm256_slli_epi32::<23>(n))
+            }
+        }
+    }
+}
+
+/// Work written once: `run` must be `#[inline(always)]`, so that it is compiled inside the function that enables the
+/// instruction set. `MR` is [`Isa::tile_rows`].
+pub(crate) trait Kernel {
+    type Out;
+    fn run<S: Simd, const MR: usize>(self) -> Self::Out;
+}
+
+/// Runs `kernel` compiled for `isa`; a set the machine lacks runs the portable build.
+pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Out {
+    // aarch64 always has fused multiply-add; the x86-64 baseline never has.
+    const BASELINE_FMA: bool = cfg!(target_arch = "aarch64");
+    #[cfg(target_arch = "x86_64")]
+    {
+        if isa == Isa::Avx2 && is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            // SAFETY: both features were just detected.
+            return unsafe { run_avx2(kernel) };
+        }
+        if isa == Isa::Avx512 && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("fma") {
+            // SAFETY: both features were just detected.
+            return unsafe { run_avx512(kernel) };
+        }
+    }
+    assert!(isa == Isa::Portable, "{isa:?} is not available on this machine");
+    kernel.run::<Lanes<4, BASELINE_FMA>, 6>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn run_avx2<K: Kernel>(kernel: K) -> K::Out {
+    kernel.run::<avx2::Avx2, 6>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2,fma")]
+fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
+    kernel.run::<Lanes<16, true>, 12>()
+}
