@@ -2,7 +2,20 @@
 //!
 //! Modules mirror the paper's parts and the names in the authors' checkpoints, so a weight file reads like the code.
 
+pub mod clip;
+pub mod config;
+mod error;
 pub mod kernels;
 pub mod metrics;
+pub mod network;
 pub mod ops;
 pub mod plain;
+mod rays;
+pub mod scene;
+pub mod weights;
+
+pub use clip::{ClipBatch, PixelLayout, ViewInput};
+pub use config::ModelConfig;
+pub use error::ModelError;
+pub use network::{ClipOutput, Stages, Storm};
+pub use scene::Scene;

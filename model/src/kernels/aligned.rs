@@ -3,7 +3,8 @@
 /// Bytes in a cache line.
 const LINE: usize = 64;
 
-/// A zeroed `f32` buffer aligned to 64 bytes.
+/// An `f32` buffer aligned to 64 bytes.
+#[derive(Default)]
 pub(crate) struct Aligned {
     values: Vec<f32>,
     start: usize,
@@ -18,6 +19,14 @@ impl Aligned {
         // An address that cannot be aligned (never seen, but allowed) only costs speed.
         let start = values.as_ptr().align_offset(LINE);
         Self { values, start: if start <= spare { start } else { 0 }, len }
+    }
+
+    /// `len` floats of whatever was there before, from a buffer that only ever grows.
+    pub(crate) fn at_least(&mut self, len: usize) -> &mut [f32] {
+        if self.len < len {
+            *self = Self::zeroed(len);
+        }
+        &mut self.as_mut_slice()[..len]
     }
 
     pub(crate) fn as_slice(&self) -> &[f32] {

@@ -209,10 +209,13 @@ impl Kernel for Task<'_> {
             for r in 0..panels * MR {
                 let row = &mut weights[r * BLOCK_KEYS..][..key_panels * nr];
                 row[count..].fill(f32::MIN);
-                let (top, sum) = softmax_row::<S>(row, largest[r]);
-                shrink[r] = exp2_one::<S>(largest[r] - top);
-                total[r] = total[r] * shrink[r] + sum;
-                largest[r] = top;
+                shrink[r] = largest[r];
+                largest[r] = row_largest::<S>(row, largest[r]);
+            }
+            shrink_sums::<S>(&mut shrink, &largest, &mut total);
+            for r in 0..panels * MR {
+                let row = &mut weights[r * BLOCK_KEYS..][..key_panels * nr];
+                total[r] += row_weights::<S>(row, largest[r]);
             }
 
             for c in 0..layout.value_dim / nr {
@@ -251,10 +254,9 @@ impl Kernel for Task<'_> {
     }
 }
 
-/// Weights `2^(x - top)` in place of the logits, with `top` the larger of `before` and the row's largest; returns `top`
-/// and the weights' sum.
+/// The largest of `before` and the row's logits (NaN is passed over: its weight will be NaN).
 #[inline(always)]
-fn softmax_row<S: Simd>(row: &mut [f32], before: f32) -> (f32, f32) {
+fn row_largest<S: Simd>(row: &[f32], before: f32) -> f32 {
     let mut tops = [S::splat(before); 2];
     for two in row.chunks_exact(2 * S::W) {
         // SAFETY: the chunk has two vectors.
@@ -263,29 +265,42 @@ fn softmax_row<S: Simd>(row: &mut [f32], before: f32) -> (f32, f32) {
             tops[1] = S::max_of(S::load(two.as_ptr().add(S::W)), tops[1]);
         }
     }
-    let top = S::largest(S::max_of(tops[0], tops[1]));
-    let subtract = S::splat(top);
-    let mut sums = [S::zero(); 2];
-    for two in row.chunks_exact_mut(2 * S::W) {
-        // SAFETY: the chunk has two vectors.
-        unsafe {
-            for h in 0..2 {
-                let p = two.as_mut_ptr().add(h * S::W);
-                let w = exp2::<S>(S::sub(S::load(p), subtract));
-                sums[h] = S::add(sums[h], w);
-                S::store(p, w);
-            }
-        }
-    }
-    (top, S::sum(S::add(sums[0], sums[1])))
+    S::largest(S::max_of(tops[0], tops[1]))
 }
 
+/// `shrink` holds the largest logits before this block; turns them into `2^(before - largest)` and scales the totals.
 #[inline(always)]
-fn exp2_one<S: Simd>(x: f32) -> f32 {
-    let mut lanes = [0f32; 16];
-    // SAFETY: no vector has more than 16 lanes.
-    unsafe { S::store(lanes.as_mut_ptr(), exp2::<S>(S::splat(x))) };
-    lanes[0]
+fn shrink_sums<S: Simd>(
+    shrink: &mut [f32; BLOCK_QUERIES],
+    largest: &[f32; BLOCK_QUERIES],
+    total: &mut [f32; BLOCK_QUERIES],
+) {
+    for at in (0..BLOCK_QUERIES).step_by(S::W) {
+        // SAFETY: BLOCK_QUERIES is a multiple of every vector's width.
+        unsafe {
+            let before = S::load(shrink.as_ptr().add(at));
+            let factor = exp2::<S>(S::sub(before, S::load(largest.as_ptr().add(at))));
+            S::store(shrink.as_mut_ptr().add(at), factor);
+            S::store(total.as_mut_ptr().add(at), S::mul(factor, S::load(total.as_ptr().add(at))));
+        }
+    }
+}
+
+/// Weights `2^(x - top)` in place of the logits; returns their sum.
+#[inline(always)]
+fn row_weights<S: Simd>(row: &mut [f32], top: f32) -> f32 {
+    let subtract = S::splat(top);
+    let mut sum = S::zero();
+    // One vector at a time: two would push the polynomial's constants out of the registers.
+    for one in row.chunks_exact_mut(S::W) {
+        // SAFETY: the chunk has one vector.
+        unsafe {
+            let w = exp2::<S>(S::sub(S::load(one.as_ptr()), subtract));
+            sum = S::add(sum, w);
+            S::store(one.as_mut_ptr(), w);
+        }
+    }
+    S::sum(sum)
 }
 
 /// `softmax(q k^T / sqrt(head_dim)) v` for `qkv` `(batch, tokens, 3 * heads * head_dim)` with rows `[q | k | v]`; `out` is

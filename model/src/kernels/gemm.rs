@@ -9,6 +9,8 @@
 //! Every output is summed in the order of `k`, in blocks fixed by `k` alone: neither the split over threads nor the
 //! row's place in `x` changes its bits.
 
+use std::cell::RefCell;
+
 use rayon::prelude::*;
 
 use super::Isa;
@@ -119,7 +121,21 @@ pub struct Epilogue<'a> {
     pub residual: Option<&'a [f32]>,
 }
 
+/// Working memory of a thread: packed rows of `x` and partial sums. Kept, because clearing it anew for every block costs
+/// as much as a few percent of the products.
+#[derive(Default)]
+struct Scratch {
+    packed: Aligned,
+    partial: Aligned,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// One task: some rows of the output.
 struct Block<'a> {
+    scratch: &'a mut Scratch,
     x: &'a [f32],
     w: &'a PackedWeight,
     bias: Option<&'a [f32]>,
@@ -128,13 +144,23 @@ struct Block<'a> {
     out: &'a mut [f32],
 }
 
-/// Row panels of `MR`, each `k` columns of `MR` floats; rows past the end stay zero.
+/// Row panels of `MR`, each `k` columns of `MR` floats; rows past the end are zeros.
 #[inline(always)]
 fn pack_rows<const MR: usize>(x: &[f32], k: usize, packed: &mut [f32]) {
     for (panel, rows) in packed.chunks_exact_mut(MR * k).zip(x.chunks(MR * k)) {
-        for (r, row) in rows.chunks_exact(k).enumerate() {
-            for (p, &v) in row.iter().enumerate() {
-                panel[p * MR + r] = v;
+        if rows.len() == MR * k {
+            let rows: [&[f32]; MR] = std::array::from_fn(|r| &rows[r * k..(r + 1) * k]);
+            for (p, column) in panel.chunks_exact_mut(MR).enumerate() {
+                for r in 0..MR {
+                    column[r] = rows[r][p];
+                }
+            }
+        } else {
+            panel.fill(0.0);
+            for (r, row) in rows.chunks_exact(k).enumerate() {
+                for (p, &v) in row.iter().enumerate() {
+                    panel[p * MR + r] = v;
+                }
             }
         }
     }
@@ -149,13 +175,11 @@ impl Kernel for Block<'_> {
         let nr = 2 * S::W;
         let m = self.out.len() / n;
         let row_panels = m.div_ceil(MR);
-        let mut packed = Aligned::zeroed(row_panels * MR * k);
-        pack_rows::<MR>(self.x, k, packed.as_mut_slice());
-        let packed = packed.as_slice();
+        let packed = self.scratch.packed.at_least(row_panels * MR * k);
+        pack_rows::<MR>(self.x, k, packed);
         let weights = self.w.data.as_slice();
         let block_panels = BLOCK_COLS / nr;
-        let mut partial = Aligned::zeroed(row_panels * MR * n.div_ceil(nr).min(block_panels) * nr);
-        let partial = partial.as_mut_slice();
+        let partial = self.scratch.partial.at_least(row_panels * MR * n.div_ceil(nr).min(block_panels) * nr);
         let depths = Depths::new(self.w.isa, k);
 
         let col_panels = n.div_ceil(nr);
@@ -264,7 +288,10 @@ pub fn linear(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, out: &mut [f3
         let count = out.len() / n;
         let residual = epilogue.residual.map(|r| &r[first * n..(first + count) * n]);
         let x = &x[first * k..(first + count) * k];
-        dispatch(w.isa, Block { x, w, bias: epilogue.bias, act: epilogue.act, residual, out });
+        // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
+        SCRATCH.with_borrow_mut(|scratch| {
+            dispatch(w.isa, Block { scratch, x, w, bias: epilogue.bias, act: epilogue.act, residual, out });
+        });
     });
 }
 

@@ -36,21 +36,35 @@ pub(crate) trait Simd: Copy + 'static {
     fn zero() -> Self::V {
         Self::splat(0.0)
     }
-    /// Sum of the lanes, in lane order.
+    /// Sum of the lanes, by halves.
     #[inline(always)]
     fn sum(v: Self::V) -> f32 {
         let mut lanes = [0f32; 16];
         // SAFETY: no vector has more than 16 lanes.
         unsafe { Self::store(lanes.as_mut_ptr(), v) };
-        lanes[..Self::W].iter().fold(0.0, |a, b| a + b)
+        let mut half = Self::W / 2;
+        while half > 0 {
+            for i in 0..half {
+                lanes[i] += lanes[i + half];
+            }
+            half /= 2;
+        }
+        lanes[0]
     }
-    /// Largest lane (NaN lanes are passed over).
+    /// Largest lane, for lanes that are not NaN.
     #[inline(always)]
     fn largest(v: Self::V) -> f32 {
         let mut lanes = [0f32; 16];
         // SAFETY: no vector has more than 16 lanes.
         unsafe { Self::store(lanes.as_mut_ptr(), v) };
-        lanes[..Self::W].iter().fold(f32::MIN, |a, &b| if b > a { b } else { a })
+        let mut half = Self::W / 2;
+        while half > 0 {
+            for i in 0..half {
+                lanes[i] = if lanes[i + half] > lanes[i] { lanes[i + half] } else { lanes[i] };
+            }
+            half /= 2;
+        }
+        lanes[0]
     }
 }
 

@@ -1,0 +1,59 @@
+use super::*;
+use crate::error::ModelError;
+
+#[test]
+fn presets_are_valid_and_read_back_the_same() {
+    for name in ["tiny", "small", "b8", "l8", "xl8", "h8", "b16", "l16", "xl16", "h16", "STORM-B/8"] {
+        let authors = ModelConfig::preset(name).unwrap();
+        for config in [authors.clone(), authors.with_paper_choices()] {
+            config.validate().unwrap();
+            let text = serde_json::to_string(&config).unwrap();
+            assert_eq!(serde_json::from_str::<ModelConfig>(&text).unwrap(), config);
+        }
+    }
+    assert_eq!(ModelConfig::preset("storm-b/8").unwrap(), ModelConfig::default());
+}
+
+#[test]
+fn paper_choices_differ_where_the_paper_does() {
+    let paper = ModelConfig::preset("b8").unwrap().with_paper_choices();
+    assert_eq!(paper.near, 0.1);
+    assert_eq!(paper.velocity_channels(), 6);
+    assert_eq!(paper.depth_meaning, DepthMeaning::RayDistance);
+    assert_eq!(paper.embed_dim, 768);
+}
+
+#[test]
+fn unknown_names_and_fields_are_refused() {
+    for name in ["", "8", "b32", "x8", "huge"] {
+        assert!(matches!(ModelConfig::preset(name), Err(ModelError::UnknownPreset { .. })), "{name}");
+    }
+    let error = serde_json::from_str::<ModelConfig>(r#"{"patchsize": 8}"#).unwrap_err().to_string();
+    assert!(error.contains("patchsize"), "{error}");
+    assert!(serde_json::from_str::<ModelConfig>(r#"{"velocity": "two"}"#).is_err());
+}
+
+#[test]
+fn every_bad_value_is_named() {
+    type Spoil = fn(&mut ModelConfig);
+    let cases: [(&str, Spoil); 12] = [
+        ("patch_size", |c| c.patch_size = 12),
+        ("num_heads", |c| c.num_heads = 7),
+        ("image_width", |c| c.image_width = 100),
+        ("num_cams", |c| c.num_cams = 7),
+        ("depth", |c| c.depth = 0),
+        ("upsampler_widths", |c| c.upsampler_widths = vec![8]),
+        ("tau", |c| c.tau = 0.0),
+        ("tau", |c| c.tau = f64::NAN),
+        ("far", |c| c.far = c.near),
+        ("max_scale", |c| c.max_scale = f64::INFINITY),
+        ("flow_gate_mps", |c| c.flow_gate_mps = -1.0),
+        ("embed_dim", |c| c.embed_dim = usize::MAX),
+    ];
+    for (field, spoil) in cases {
+        let mut config = ModelConfig::default();
+        spoil(&mut config);
+        let error = config.validate().unwrap_err().to_string();
+        assert!(error.contains(field), "{field}: {error}");
+    }
+}

@@ -1,0 +1,96 @@
+//! Pictures, rays and times to image tokens (paper section 3.1, "Network and input").
+
+use candle_core::{DType, Tensor};
+
+use super::params::Params;
+use super::resample::resample;
+use super::stages::Stages;
+use crate::clip::ClipBatch;
+use crate::config::ModelConfig;
+use crate::error::ModelError;
+use crate::ops::{Activation, Linear, linear};
+use crate::rays::Rays;
+use crate::weights::names::TIME_CHANNELS;
+
+/// Longest period of the time encoding over its shortest.
+const TIME_PERIODS: f64 = 1e4;
+
+/// Patch, position and time embedding.
+#[derive(Debug, Clone)]
+pub(crate) struct Embed {
+    patch: usize,
+    grid: (usize, usize),
+    proj: Linear,
+    position: Option<Tensor>,
+    time: [Linear; 2],
+}
+
+impl Embed {
+    pub fn new(config: &ModelConfig, params: &Params<'_>) -> Result<Self, ModelError> {
+        let position = if config.disable_pos_embed { None } else { Some(params.get("pos_embed")?) };
+        Ok(Self {
+            patch: config.patch_size,
+            grid: config.grid(),
+            proj: params.linear("patch_embed.proj")?,
+            position,
+            time: [params.linear("time_embedder.mlp.0")?, params.linear("time_embedder.mlp.2")?],
+        })
+    }
+
+    /// `(b, t v rows cols, d)`.
+    pub fn forward(&self, batch: &ClipBatch, rays: &Rays, stages: &mut Stages) -> Result<Tensor, ModelError> {
+        let [b, t, v, h, w] = batch.dims()?;
+        let (p, d) = (self.patch, self.proj.weight.dim(0)?);
+        let (rows, cols) = (h / p, w / p);
+        let views = b * t * v;
+        let pixels = Tensor::cat(&[&batch.image.reshape((views, 3, h, w))?, &rays.plucker], 1)?;
+        let patches = pixels
+            .reshape(vec![views, ModelConfig::INPUT_CHANNELS, rows, p, cols, p])?
+            .permute(vec![0, 2, 4, 1, 3, 5])?
+            .contiguous()?
+            .reshape((views * rows * cols, ModelConfig::INPUT_CHANNELS * p * p))?;
+        let proj = Linear { weight: self.proj.weight.reshape((d, ()))?, bias: self.proj.bias.clone() };
+        let tokens = linear(&patches, &proj, Activation::None, None)?.reshape((views, rows * cols, d))?;
+        if stages.wants("patch_embed") {
+            stages.keep("patch_embed", &tokens.reshape((views, rows, cols, d))?);
+        }
+        let tokens = match self.position(rows, cols)? {
+            Some(position) => tokens.broadcast_add(&position)?,
+            None => tokens,
+        };
+        let tokens = tokens.broadcast_add(&self.time(batch, stages)?.reshape((views, 1, d))?)?;
+        Ok(tokens.reshape((b, t * v * rows * cols, d))?)
+    }
+
+    /// `(1, rows cols, d)` for a patch grid, or none when the network has no position embedding.
+    pub fn position(&self, rows: usize, cols: usize) -> Result<Option<Tensor>, ModelError> {
+        Ok(self.position.as_ref().map(|x| resample(x, self.grid, (rows, cols))).transpose()?)
+    }
+
+    /// `(b, t, v, d)`.
+    fn time(&self, batch: &ClipBatch, stages: &mut Stages) -> Result<Tensor, ModelError> {
+        let shape = batch.time_sec.dims().to_vec();
+        let times = batch.time_sec.flatten_all()?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
+        if let Some(index) = times.iter().position(|t| !t.is_finite()) {
+            let (timestep, camera) = (index / shape[2] % shape[1], index % shape[2]);
+            return Err(ModelError::NonFiniteInput { what: "time", camera, timestep, count: 1 });
+        }
+        let half = TIME_CHANNELS / 2;
+        let mut waves = Vec::with_capacity(times.len() * TIME_CHANNELS);
+        for time in times {
+            let angles = (0..half).map(|k| {
+                let frequency = (-TIME_PERIODS.ln() * k as f64 / half as f64).exp();
+                time / batch.timespan_sec * frequency
+            });
+            waves.extend(angles.clone().map(|a| a.cos() as f32));
+            waves.extend(angles.map(|a| a.sin() as f32));
+        }
+        let frequency_shape = [&shape[..], &[TIME_CHANNELS]].concat();
+        let waves = Tensor::from_vec(waves, frequency_shape, batch.time_sec.device())?;
+        stages.keep("time_freq", &waves);
+        let x = linear(&waves, &self.time[0], Activation::Silu, None)?;
+        let x = linear(&x, &self.time[1], Activation::None, None)?;
+        stages.keep("time_embed", &x);
+        Ok(x)
+    }
+}

@@ -1,0 +1,193 @@
+//! STORM itself: pictures with poses in, moving Gaussians out. Modules carry the names of the authors' checkpoints.
+
+mod embed;
+mod gaussians;
+mod motion;
+mod output;
+mod params;
+mod resample;
+mod sky;
+mod stages;
+mod transformer;
+mod upsample;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use candle_core::{Device, Tensor};
+pub use output::ClipOutput;
+pub(crate) use params::NORM_EPS;
+use params::Params;
+pub use stages::Stages;
+
+use crate::clip::ClipBatch;
+use crate::config::ModelConfig;
+use crate::error::ModelError;
+use crate::ops::{Activation, Linear, linear};
+use crate::rays::Rays;
+use crate::weights::{self, Tensors};
+
+/// The network with its weights. Cheap to clone (weights are shared).
+#[derive(Debug, Clone)]
+pub struct Storm {
+    config: Arc<ModelConfig>,
+    embed: embed::Embed,
+    sky_token: Option<Tensor>,
+    affine_token: Option<Tensor>,
+    motion_tokens: Option<Tensor>,
+    transformer: transformer::Transformer,
+    gaussians: gaussians::GaussianHead,
+    motion: motion::MotionHead,
+    sky: Option<Arc<sky::SkyHead>>,
+    affine: Option<Linear>,
+}
+
+impl Storm {
+    /// The network over given tensors (all on one device, f32), named as [`weights::tensor_specs`] lists them.
+    ///
+    /// Tensors that are variables stay variables: to train, pass each variable's tensor.
+    ///
+    /// # Errors
+    /// An invalid configuration, or a missing, extra or mis-shaped tensor.
+    pub fn new(config: &ModelConfig, tensors: &Tensors) -> Result<Self, ModelError> {
+        config.validate()?;
+        weights::check_shapes(config, tensors.iter().map(|(name, x)| (name.as_str(), x.dims())))?;
+        let params = Params(tensors);
+        let mut config = config.clone();
+        config.max_scale = weights::frozen_max_scale(tensors)?;
+        let token = |used: bool, name: &str| used.then(|| params.get(name)).transpose();
+        let sky = config.use_sky_token.then(|| sky::SkyHead::new(&config, &params)).transpose()?;
+        Ok(Self {
+            embed: embed::Embed::new(&config, &params)?,
+            sky_token: token(config.use_sky_token, "sky_token")?,
+            affine_token: token(config.use_affine_token, "affine_token")?,
+            motion_tokens: token(config.num_motion_tokens > 0, "motion_tokens")?,
+            transformer: transformer::Transformer::new(&config, &params)?,
+            gaussians: gaussians::GaussianHead::new(&params)?,
+            motion: motion::MotionHead::new(&config, &params)?,
+            sky: sky.map(Arc::new),
+            affine: config.use_affine_token.then(|| params.linear("affine_linear")).transpose()?,
+            config: Arc::new(config),
+        })
+    }
+
+    /// The network in a weight file: safetensors, or a PyTorch `.pth`/`.pt` (state dict or training checkpoint).
+    ///
+    /// The configuration comes from the file's metadata, else from its tensors' shapes (with the authors' choices).
+    pub fn load(path: &Path, device: &Device) -> Result<Self, ModelError> {
+        let (config, tensors) = weights::load(path, None, device)?;
+        Self::new(&config, &tensors)
+    }
+
+    /// The network in a weight file, with this configuration instead of the file's own or the inferred one.
+    pub fn load_as(path: &Path, config: &ModelConfig, device: &Device) -> Result<Self, ModelError> {
+        let (config, tensors) = weights::load(path, Some(config), device)?;
+        Self::new(&config, &tensors)
+    }
+
+    /// An untrained network; the same seed gives the same network everywhere.
+    pub fn untrained(config: &ModelConfig, seed: u64, device: &Device) -> Result<Self, ModelError> {
+        Self::new(config, &weights::untrained(config, seed, device)?)
+    }
+
+    /// The configuration, `max_scale` as the weights have it.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+
+    /// Runs the network over a batch of windows.
+    ///
+    /// Any 1-10 timesteps, 1-6 cameras (with affine tokens at most `num_cams`, fewer use the first ones) and any
+    /// picture size that is a multiple of the patch size.
+    pub fn forward(&self, batch: &ClipBatch) -> Result<ClipOutput, ModelError> {
+        self.forward_stages(batch, &mut Stages::none())
+    }
+
+    /// As [`Storm::forward`], keeping the intermediate tensors that `stages` asks for.
+    pub fn forward_stages(&self, batch: &ClipBatch, stages: &mut Stages) -> Result<ClipOutput, ModelError> {
+        let config = &*self.config;
+        let dims @ [_, _, v, h, w] = batch.dims()?;
+        self.check_sizes(v, h, w)?;
+        let rays = Rays::new(config, batch)?;
+        stages.keep("ray_directions", &rays.directions);
+        stages.keep("plucker", &rays.plucker);
+        let image_tokens = self.embed.forward(batch, &rays, stages)?;
+        let tokens = self.with_extra_tokens(image_tokens, v)?;
+        stages.keep("tokens_in", &tokens);
+        let tokens = self.transformer.forward(tokens, stages)?;
+
+        let (mut at, d) = (0, config.embed_dim);
+        let mut take = |count: usize| {
+            at += count;
+            tokens.narrow(1, at - count, count)?.contiguous()
+        };
+        let sky_token = if self.sky.is_some() { Some(take(1)?) } else { None };
+        let affine = match &self.affine {
+            Some(layer) => Some(linear(&take(v)?, layer, Activation::None, None)?.reshape((dims[0], v, 3, 4))?),
+            None => None,
+        };
+        let motion_tokens = if self.motion_tokens.is_some() { Some(take(config.num_motion_tokens)?) } else { None };
+        let patches = (h / config.patch_size) * (w / config.patch_size);
+        let image_tokens = take(dims[1] * v * patches)?;
+        debug_assert_eq!(image_tokens.dims()[2], d);
+
+        let gaussians = self.gaussians.forward(config, &image_tokens, &batch.image, &rays, stages)?;
+        let motion = self.motion.forward(config, &image_tokens, motion_tokens.as_ref(), dims, stages)?;
+        Ok(ClipOutput {
+            means: gaussians.means,
+            scales: gaussians.scales,
+            quats: gaussians.quats,
+            opacities: gaussians.opacities,
+            colors: gaussians.colors,
+            depths: gaussians.depths,
+            velocity_backward: motion.velocity_backward,
+            velocity_forward: motion.velocity_forward,
+            motion_weights: motion.weights,
+            motion_bases: motion.bases,
+            affine,
+            sky_token,
+            time_sec: batch.time_sec.clone(),
+            config: Arc::clone(&self.config),
+            sky: self.sky.clone(),
+        })
+    }
+
+    /// The position embedding on a patch grid, `(1, rows * cols, embed_dim)`; none when the network has none.
+    pub fn position_embedding(&self, rows: usize, cols: usize) -> Result<Option<Tensor>, ModelError> {
+        self.embed.position(rows, cols)
+    }
+
+    fn check_sizes(&self, cameras: usize, height: usize, width: usize) -> Result<(), ModelError> {
+        let (patch, most) = (self.config.patch_size, self.config.num_cams);
+        if height == 0 || width == 0 || height % patch != 0 || width % patch != 0 {
+            let text = format!("pictures are {width}x{height} pixels; both sides must be multiples of {patch}");
+            return Err(ModelError::Input(text));
+        }
+        if self.affine_token.is_some() && cameras > most {
+            let text = format!("{cameras} cameras, but the network has affine tokens for {most}; use fewer cameras");
+            return Err(ModelError::Input(text));
+        }
+        Ok(())
+    }
+
+    /// Puts `[sky | affine, one per camera | motion]` in front of the image tokens `(b, n, d)`.
+    fn with_extra_tokens(&self, image: Tensor, cameras: usize) -> Result<Tensor, ModelError> {
+        let (b, _, d) = image.dims3()?;
+        let mut parts = Vec::with_capacity(4);
+        let mut push = |token: &Tensor| -> Result<(), ModelError> {
+            parts.push(token.expand((b, token.dim(1)?, d))?.contiguous()?);
+            Ok(())
+        };
+        if let Some(token) = &self.sky_token {
+            push(token)?;
+        }
+        if let Some(token) = &self.affine_token {
+            push(&token.narrow(1, 0, cameras)?)?;
+        }
+        if let Some(tokens) = &self.motion_tokens {
+            push(tokens)?;
+        }
+        parts.push(image);
+        Ok(Tensor::cat(&parts, 1)?)
+    }
+}

@@ -1,0 +1,127 @@
+//! Motion tokens and mask decoder: velocities as a soft mixture of a few bases (paper section 3.1).
+
+use candle_core::{D, Tensor};
+use candle_nn::ops::softmax;
+
+use super::params::{Mlp, Params};
+use super::stages::Stages;
+use super::upsample::{Upsampler, unnest};
+use crate::config::{MaskDecoder, ModelConfig, VelocityKind};
+use crate::error::ModelError;
+
+/// Velocities of every pixel and how they came about.
+pub(crate) struct Motion {
+    /// `(b, t, v, h, w, 3)`, m/s, used for earlier times.
+    pub velocity_backward: Tensor,
+    /// `(b, t, v, h, w, 3)`, m/s, used for later times.
+    pub velocity_forward: Tensor,
+    /// `(b, t, v, h, w, M)`, rows sum to 1; none without motion tokens.
+    pub weights: Option<Tensor>,
+    /// `(b, M, 3 | 6)`, m/s as the network states them.
+    pub bases: Option<Tensor>,
+}
+
+/// The decoder.
+#[derive(Debug, Clone)]
+pub(crate) struct MotionHead {
+    upsampler: Upsampler,
+    keys: Mlp,
+    queries: Vec<Mlp>,
+    /// One, or one per token.
+    bases: Vec<Mlp>,
+}
+
+/// The picture whose pixel-wise stages are kept for comparison: timestep 0, camera 1 (camera 0 of one-camera windows).
+const PROBED_PICTURE: usize = 1;
+
+impl MotionHead {
+    pub fn new(config: &ModelConfig, params: &Params<'_>) -> Result<Self, ModelError> {
+        let m = config.num_motion_tokens;
+        let bases = if config.mask_decoder == MaskDecoder::Paper && m > 0 {
+            (0..m).map(|k| params.mlp(&format!("motion_basis_decoders.{k}"))).collect::<Result<_, _>>()?
+        } else {
+            vec![params.mlp("motion_basis_decoder")?]
+        };
+        let queries = (0..m).map(|k| params.mlp(&format!("motion_query_heads.{k}")));
+        Ok(Self {
+            upsampler: Upsampler::new(config, params)?,
+            keys: params.mlp("motion_key_head")?,
+            queries: queries.collect::<Result<_, _>>()?,
+            bases,
+        })
+    }
+
+    /// `image` tokens `(b, t v rows cols, d)` and `motion` tokens `(b, M, d)`; `dims` is `(b, t, v, h, w)`.
+    pub fn forward(
+        &self,
+        config: &ModelConfig,
+        image: &Tensor,
+        motion: Option<&Tensor>,
+        dims: [usize; 5],
+        stages: &mut Stages,
+    ) -> Result<Motion, ModelError> {
+        let [b, t, v, h, w] = dims;
+        let levels = config.upsampler_widths.len();
+        let grid = (h >> levels, w >> levels);
+        let pictures = image.reshape((b * t * v, grid.0 * grid.1, config.embed_dim))?;
+        let mixture = motion.map(|tokens| self.mixture(tokens, config)).transpose()?;
+        if let Some((queries, bases)) = &mixture {
+            stages.keep("motion_queries", queries);
+            stages.keep("motion_bases", bases);
+        }
+        let upsampler = self.upsampler.prepare()?;
+        let mut none = Stages::none();
+        let (mut all_weights, mut all_velocities) = (Vec::new(), Vec::new());
+        // One picture at a time: pixel features of a whole window would not fit in memory at full size.
+        for picture in 0..b * t * v {
+            let probed = picture == PROBED_PICTURE.min(t * v - 1);
+            let stages = if probed { &mut *stages } else { &mut none };
+            let features = upsampler.forward(&pictures.get(picture)?, grid, stages)?;
+            let keys = self.keys.forward(&features)?;
+            if stages.wants("motion_keys") {
+                stages.keep("motion_keys", &unnest(&keys, grid, levels)?);
+            }
+            let velocity = match &mixture {
+                Some((queries, bases)) => {
+                    let window = picture / (t * v);
+                    let logits = keys.matmul(&queries.get(window)?.t()?)?;
+                    let weights = softmax(&(logits / config.tau)?, D::Minus1)?;
+                    let velocity = weights.matmul(&bases.get(window)?)?;
+                    all_weights.push(unnest(&weights, grid, levels)?);
+                    velocity
+                }
+                None => (self.bases[0].forward(&keys)? * config.velocity_scale)?,
+            };
+            all_velocities.push(unnest(&velocity, grid, levels)?);
+        }
+        let velocity = Tensor::stack(&all_velocities, 0)?.reshape((b, t, v, h, w, config.velocity_channels()))?;
+        let weights = match all_weights.first() {
+            Some(first) => Some(Tensor::stack(&all_weights, 0)?.reshape((b, t, v, h, w, first.dim(2)?))?),
+            None => None,
+        };
+        let (velocity_backward, velocity_forward) = match config.velocity {
+            VelocityKind::One => (velocity.clone(), velocity),
+            // Paper eq. 1 subtracts (t' - t) v- for earlier times: as a velocity in metres per second it is -v-.
+            VelocityKind::ForwardBackward => {
+                let backward = velocity.narrow(D::Minus1, 0, 3)?.neg()?;
+                (backward, velocity.narrow(D::Minus1, 3, 3)?.contiguous()?)
+            }
+        };
+        Ok(Motion { velocity_backward, velocity_forward, weights, bases: mixture.map(|(_, bases)| bases) })
+    }
+
+    /// Queries `(b, M, e)` and scaled bases `(b, M, 3 | 6)` of the motion tokens.
+    fn mixture(&self, tokens: &Tensor, config: &ModelConfig) -> Result<(Tensor, Tensor), ModelError> {
+        let each = |mlps: &[Mlp]| -> Result<Tensor, ModelError> {
+            let rows = mlps.iter().enumerate().map(|(k, mlp)| mlp.forward(&tokens.narrow(1, k, 1)?.contiguous()?));
+            Ok(Tensor::cat(&rows.collect::<candle_core::Result<Vec<_>>>()?, 1)?)
+        };
+        let queries = each(&self.queries)?;
+        let bases = match &self.bases[..] {
+            [shared] => shared.forward(&tokens.contiguous()?)?,
+            own => each(own)?,
+        };
+        let bases = if config.velocity_scale == 1.0 { bases } else { (bases * config.velocity_scale)? };
+        Ok((queries, bases))
+    }
+}

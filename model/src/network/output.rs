@@ -1,0 +1,162 @@
+//! What the network says about a batch of windows, as tensors.
+
+use std::sync::Arc;
+
+use candle_core::{D, Tensor};
+use storm_render::Gaussians;
+
+use super::sky::SkyHead;
+use crate::config::{AffineKind, ModelConfig};
+use crate::error::ModelError;
+use crate::scene::{Affine, Scene, SceneShape, SkyModel};
+
+/// Tensors of a forward pass; metres, seconds, m/s, in the window's world. Gradients flow through all of them.
+#[derive(Debug, Clone)]
+pub struct ClipOutput {
+    /// `(b, t, v, h, w, 3)` centres at the pixel's own time.
+    pub means: Tensor,
+    /// `(b, t, v, h, w, 3)` linear scales.
+    pub scales: Tensor,
+    /// `(b, t, v, h, w, 4)` quaternions w, x, y, z, not normalised.
+    pub quats: Tensor,
+    /// `(b, t, v, h, w)`, 0-1.
+    pub opacities: Tensor,
+    /// `(b, t, v, h, w, 3)`, network range: -1..1 is black to white.
+    pub colors: Tensor,
+    /// `(b, t, v, h, w)` z-depth or ray distance, see [`crate::config::DepthMeaning`].
+    pub depths: Tensor,
+    /// `(b, t, v, h, w, 3)` velocity for earlier times (paper: `-v-`).
+    pub velocity_backward: Tensor,
+    /// `(b, t, v, h, w, 3)` velocity for later times; the same tensor for one-velocity networks.
+    pub velocity_forward: Tensor,
+    /// `(b, t, v, h, w, M)` soft motion groups; none without motion tokens.
+    pub motion_weights: Option<Tensor>,
+    /// `(b, M, 3 | 6)` velocity bases as the network states them; none without motion tokens.
+    pub motion_bases: Option<Tensor>,
+    /// `(b, v, 3, 4)` exposure matrices, see [`crate::config::AffineKind`].
+    pub affine: Option<Tensor>,
+    /// `(b, 1, embed_dim)`; colours the sky through [`ClipOutput::sky_color`].
+    pub sky_token: Option<Tensor>,
+    /// `(b, t, v)` seconds, as given.
+    pub time_sec: Tensor,
+    /// The network's configuration.
+    pub config: Arc<ModelConfig>,
+    pub(super) sky: Option<Arc<SkyHead>>,
+}
+
+impl ClipOutput {
+    /// Sky colours `(b, n, 3)` of world directions `(b, n, 3)` that have z = 1 in their camera; none without a sky token.
+    pub fn sky_color(&self, directions: &Tensor) -> Result<Option<Tensor>, ModelError> {
+        match (&self.sky, &self.sky_token) {
+            (Some(head), Some(token)) => Ok(Some(head.forward(directions, token)?)),
+            _ => Ok(None),
+        }
+    }
+
+    /// Exposure applied to colours `(b, v, n, 3)`, cameras in the window's order; unchanged without affine tokens.
+    pub fn apply_affine(&self, colors: &Tensor) -> Result<Tensor, ModelError> {
+        let Some(affine) = &self.affine else {
+            return Ok(colors.clone());
+        };
+        Ok(match self.config.affine {
+            AffineKind::Gain => colors.broadcast_mul(&affine.sum(D::Minus1)?.unsqueeze(2)?)?,
+            AffineKind::MatrixBias => {
+                let matrix = affine.narrow(D::Minus1, 0, 3)?.transpose(2, 3)?.contiguous()?;
+                let bias = affine.narrow(D::Minus1, 3, 1)?.squeeze(D::Minus1)?.unsqueeze(2)?;
+                colors.contiguous()?.matmul(&matrix)?.broadcast_add(&bias)?
+            }
+        })
+    }
+
+    /// Window `index` of the batch as plain numbers, ready to render or publish.
+    ///
+    /// # Errors
+    /// [`ModelError::NonFinite`] names the first tensor that holds a NaN or an infinity.
+    pub fn scene(&self, index: usize) -> Result<Scene, ModelError> {
+        let &[b, t, v, h, w] = self.opacities.dims() else {
+            return Err(ModelError::Input("opacities are not (b, t, v, h, w)".into()));
+        };
+        if index >= b {
+            return Err(ModelError::Input(format!("window {index} of a batch of {b}")));
+        }
+        let read = |name: &str, x: &Tensor| plain(name, &x.get(index)?);
+        let times = read("time_sec", &self.time_sec)?;
+        let (motion_count, motion_weights) = match &self.motion_weights {
+            Some(weights) => (weights.dim(D::Minus1)?, read("motion_weights", weights)?),
+            None => (0, Vec::new()),
+        };
+        let gaussians = Gaussians {
+            means: read("means", &self.means)?.chunks_exact(3).map(triple).collect(),
+            quats: read("quats", &self.quats)?.chunks_exact(4).map(|q| [q[0], q[1], q[2], q[3]]).collect(),
+            scales: read("scales", &self.scales)?.chunks_exact(3).map(triple).collect(),
+            opacities: read("opacities", &self.opacities)?,
+            colors: read("colors", &self.colors)?.chunks_exact(3).map(triple).collect(),
+            velocity_backward: read("velocity_backward", &self.velocity_backward)?
+                .chunks_exact(3)
+                .map(triple)
+                .collect(),
+            velocity_forward: read("velocity_forward", &self.velocity_forward)?.chunks_exact(3).map(triple).collect(),
+            time_sec: times.iter().flat_map(|&time| std::iter::repeat_n(time, h * w)).collect(),
+            motion_count,
+            motion_weights,
+        };
+        let sky = match (&self.sky, &self.sky_token) {
+            (Some(head), Some(token)) => {
+                let token = token.narrow(0, index, 1)?;
+                plain("sky_token", &token)?;
+                Some(sky_model(&self.config, head, &token)?)
+            }
+            _ => None,
+        };
+        let affine = match &self.affine {
+            Some(affine) => {
+                read("affine", affine)?.chunks_exact(12).map(|a| Affine::new(self.config.affine, a)).collect()
+            }
+            None => Vec::new(),
+        };
+        let motion_bases = match &self.motion_bases {
+            Some(bases) => read("motion_bases", bases)?.chunks(bases.dim(2)?).map(<[f32]>::to_vec).collect(),
+            None => Vec::new(),
+        };
+        Ok(Scene {
+            gaussians,
+            shape: SceneShape { timesteps: t, cameras: v, height: h, width: w },
+            depths: read("depths", &self.depths)?,
+            sky,
+            affine,
+            motion_bases,
+            config: Arc::clone(&self.config),
+        })
+    }
+}
+
+fn triple(x: &[f32]) -> [f32; 3] {
+    [x[0], x[1], x[2]]
+}
+
+/// All values of a tensor on the host, refused when one is not finite.
+fn plain(name: &str, x: &Tensor) -> Result<Vec<f32>, ModelError> {
+    let values = x.flatten_all()?.to_vec1::<f32>()?;
+    let count = values.iter().filter(|x| !x.is_finite()).count();
+    if count > 0 {
+        return Err(ModelError::NonFinite { tensor: name.to_owned(), count });
+    }
+    Ok(values)
+}
+
+fn sky_model(config: &ModelConfig, head: &SkyHead, token: &Tensor) -> Result<SkyModel, ModelError> {
+    let (shift, scale) = head.modulate(token)?;
+    let bias = |layer: &crate::ops::Linear, name: &str| match &layer.bias {
+        Some(bias) => plain(name, bias),
+        None => Ok(vec![0.0; layer.weight.dim(0)?]),
+    };
+    Ok(SkyModel::collapse(
+        config.sky,
+        &plain("sky_head.linear.weight", &head.linear.weight)?,
+        &bias(&head.linear, "sky_head.linear.bias")?,
+        &plain("sky shift", &shift)?,
+        &plain("sky scale", &scale)?,
+        &plain("sky_head.output.weight", &head.output.weight)?,
+        &bias(&head.output, "sky_head.output.bias")?,
+    ))
+}

@@ -1,0 +1,63 @@
+//! Layers by their name in the weight file.
+
+use candle_core::Tensor;
+
+use crate::error::ModelError;
+use crate::ops::{Activation, Linear, layer_norm, linear};
+use crate::weights::{Tensors, WeightsError};
+
+/// Epsilon of every layer norm.
+pub(crate) const NORM_EPS: f64 = 1e-6;
+
+/// Looks tensors up by name.
+pub(crate) struct Params<'a>(pub &'a Tensors);
+
+impl Params<'_> {
+    pub fn get(&self, name: &str) -> Result<Tensor, ModelError> {
+        self.0.get(name).cloned().ok_or_else(|| WeightsError::missing(name).into())
+    }
+
+    pub fn linear(&self, name: &str) -> Result<Linear, ModelError> {
+        let weight = self.get(&format!("{name}.weight"))?;
+        Ok(Linear { weight, bias: Some(self.get(&format!("{name}.bias"))?) })
+    }
+
+    pub fn norm(&self, name: &str) -> Result<Norm, ModelError> {
+        Ok(Norm { weight: self.get(&format!("{name}.weight"))?, bias: self.get(&format!("{name}.bias"))? })
+    }
+
+    /// `fc1`, `fc2`, ... as many as there are.
+    pub fn mlp(&self, name: &str) -> Result<Mlp, ModelError> {
+        let count = (1..).take_while(|k| self.0.contains_key(&format!("{name}.fc{k}.weight"))).count();
+        let layers = (1..=count.max(1)).map(|k| self.linear(&format!("{name}.fc{k}")));
+        Ok(Mlp(layers.collect::<Result<_, _>>()?))
+    }
+}
+
+/// Layer norm with gain and offset.
+#[derive(Debug, Clone)]
+pub(crate) struct Norm {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl Norm {
+    pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
+        layer_norm(x, Some(&self.weight), Some(&self.bias), NORM_EPS)
+    }
+}
+
+/// Linear layers with GELU between them.
+#[derive(Debug, Clone)]
+pub(crate) struct Mlp(Vec<Linear>);
+
+impl Mlp {
+    pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
+        let mut x = x.clone();
+        for (k, layer) in self.0.iter().enumerate() {
+            let act = if k + 1 < self.0.len() { Activation::Gelu } else { Activation::None };
+            x = linear(&x, layer, act, None)?;
+        }
+        Ok(x)
+    }
+}

@@ -1,0 +1,125 @@
+//! The mask decoder's upsampler: token features to pixel features.
+//!
+//! A transposed convolution with kernel 2 and stride 2 does not overlap, so it is one linear layer from a pixel to its
+//! four children. Pixels are kept in that nested order (patch, child, child of child, ...): every layer is then a plain
+//! matrix product over rows, and one permutation at the very end puts the result into rows and columns.
+
+use candle_core::{Result, Tensor};
+
+use super::params::{Norm, Params};
+use super::stages::Stages;
+use crate::config::ModelConfig;
+use crate::error::ModelError;
+use crate::ops::{Activation, Linear, linear};
+use crate::weights::names::upsampler_norm;
+
+#[derive(Debug, Clone)]
+struct Doubling {
+    /// `(in, out, 2, 2)`, as PyTorch's ConvTranspose2d stores it.
+    conv: Linear,
+    norm: Option<Norm>,
+}
+
+/// The stack of doublings.
+#[derive(Debug, Clone)]
+pub(crate) struct Upsampler(Vec<Doubling>);
+
+/// The same layers as matrices; made once per forward pass, so that weights in training are followed.
+pub(crate) struct Prepared(Vec<(Linear, usize, Option<Norm>)>);
+
+impl Upsampler {
+    pub fn new(config: &ModelConfig, params: &Params<'_>) -> std::result::Result<Self, ModelError> {
+        let stage = |k: usize| {
+            let norm = upsampler_norm(config, k).then(|| params.norm(&format!("output_upscaling.{}", 3 * k + 1)));
+            let conv = params.linear(&format!("output_upscaling.{}", 3 * k))?;
+            Ok::<_, ModelError>(Doubling { conv, norm: norm.transpose()? })
+        };
+        Ok(Self((0..config.upsampler_widths.len()).map(stage).collect::<std::result::Result<_, _>>()?))
+    }
+
+    pub fn prepare(&self) -> Result<Prepared> {
+        let prepare = |stage: &Doubling| {
+            let (inputs, width, _, _) = stage.conv.weight.dims4()?;
+            let weight = stage.conv.weight.permute((2, 3, 1, 0))?.contiguous()?.reshape((4 * width, inputs))?;
+            let bias = match &stage.conv.bias {
+                Some(bias) => Some(Tensor::cat(&[bias, bias, bias, bias], 0)?),
+                None => None,
+            };
+            Ok((Linear { weight, bias }, width, stage.norm.clone()))
+        };
+        Ok(Prepared(self.0.iter().map(prepare).collect::<Result<_>>()?))
+    }
+}
+
+impl Prepared {
+    /// `(patches, d)` of one picture to `(patches * 4^stages, width)` in nested order.
+    ///
+    /// `grid` is used only to name the stages kept for comparison.
+    pub fn forward(&self, patches: &Tensor, grid: (usize, usize), stages: &mut Stages) -> Result<Tensor> {
+        let mut x = patches.clone();
+        for (k, (layer, width, norm)) in self.0.iter().enumerate() {
+            x = linear(&x, layer, Activation::None, None)?.reshape(((), *width))?;
+            keep(stages, 3 * k, &x, grid, k + 1)?;
+            if let Some(norm) = norm {
+                x = norm.forward(&x)?;
+                keep(stages, 3 * k + 1, &x, grid, k + 1)?;
+            }
+            x = x.gelu_erf()?;
+            keep(stages, 3 * k + 2, &x, grid, k + 1)?;
+        }
+        Ok(x)
+    }
+}
+
+fn keep(stages: &mut Stages, layer: usize, x: &Tensor, grid: (usize, usize), levels: usize) -> Result<()> {
+    let name = format!("upscaling_{layer}");
+    if stages.wants(&name) {
+        stages.keep(&name, &unnest(x, grid, levels)?);
+    }
+    Ok(())
+}
+
+/// `(rows cols 4^levels, c)` in nested order to `(rows 2^levels, cols 2^levels, c)`.
+pub(crate) fn unnest(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<Tensor> {
+    let c = x.dim(1)?;
+    let mut shape = vec![grid.0, grid.1];
+    shape.extend(std::iter::repeat_n(2, 2 * levels));
+    shape.push(c);
+    // Axes: row, col, then (row bit, col bit) per level, coarse to fine.
+    let rows = std::iter::once(0).chain((0..levels).map(|k| 2 + 2 * k));
+    let cols = std::iter::once(1).chain((0..levels).map(|k| 3 + 2 * k));
+    let axes: Vec<usize> = rows.chain(cols).chain(std::iter::once(2 + 2 * levels)).collect();
+    let side = 1 << levels;
+    x.reshape(shape)?.permute(axes)?.contiguous()?.reshape((grid.0 * side, grid.1 * side, c))
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{DType, Device};
+
+    use super::*;
+
+    #[test]
+    fn linear_and_unnest_are_the_transposed_convolution() {
+        // A small asymmetric case against candle's own conv_transpose2d, two levels deep.
+        let device = Device::Cpu;
+        let wave = |n: usize, f: f64| -> Vec<f32> { (0..n).map(|i| (f * i as f64).sin() as f32).collect() };
+        let (rows, cols, d, c1, c2) = (2, 3, 5, 4, 3);
+        let x = Tensor::from_vec(wave(rows * cols * d, 0.7), (rows * cols, d), &device).unwrap();
+        let w1 = Tensor::from_vec(wave(d * c1 * 4, 0.31), (d, c1, 2, 2), &device).unwrap();
+        let w2 = Tensor::from_vec(wave(c1 * c2 * 4, 0.17), (c1, c2, 2, 2), &device).unwrap();
+        let layer = |w: &Tensor, c: usize| Doubling {
+            conv: Linear { weight: w.clone(), bias: Some(Tensor::zeros(c, DType::F32, &device).unwrap()) },
+            norm: None,
+        };
+        let prepared = Upsampler(vec![layer(&w1, c1), layer(&w2, c2)]).prepare().unwrap();
+        let ours = prepared.forward(&x, (rows, cols), &mut Stages::none()).unwrap();
+        let ours = unnest(&ours, (rows, cols), 2).unwrap();
+        let chw = x.reshape((1, rows, cols, d)).unwrap().permute((0, 3, 1, 2)).unwrap().contiguous().unwrap();
+        let y = chw.conv_transpose2d(&w1, 0, 0, 2, 1).unwrap().gelu_erf().unwrap();
+        let y = y.conv_transpose2d(&w2, 0, 0, 2, 1).unwrap().gelu_erf().unwrap();
+        let y = y.squeeze(0).unwrap().permute((1, 2, 0)).unwrap();
+        let worst = (ours - y).unwrap().abs().unwrap().flatten_all().unwrap().max(0).unwrap();
+        assert!(worst.to_scalar::<f32>().unwrap() < 1e-5);
+    }
+}
