@@ -6,6 +6,7 @@
 mod cell;
 mod cloud;
 mod eigen;
+mod hash;
 mod select;
 
 use std::collections::HashMap;
@@ -18,11 +19,12 @@ use crate::config::MapConfig;
 use crate::rigid::Rigid;
 use cell::{Cell, Sample, covariance};
 pub use cloud::MapCloud;
+use hash::VoxelHash;
 pub use select::{color01, confidence, static_weight};
 
 /// Part of a full map that goes at once when it is full: few enough to be a small loss, enough that finding them is paid for by
 /// many insertions.
-const EVICTED_PART: usize = 32;
+const EVICTED_PART: usize = 64;
 
 /// Standard deviations beyond this are no surface but a mistake, metres (and their squares stay far inside f32).
 const MAX_SCALE_M: f32 = 1e3;
@@ -68,7 +70,7 @@ pub struct VoxelMap {
     max_cells: usize,
     origin: Option<DVec3>,
     cells: Vec<Cell>,
-    index: HashMap<[i32; 3], u32>,
+    index: HashMap<[i32; 3], u32, VoxelHash>,
     counts: MapCounts,
 }
 
@@ -80,7 +82,7 @@ impl VoxelMap {
             max_cells: config.max_gaussians.clamp(1, u32::MAX as usize),
             origin: None,
             cells: Vec::new(),
-            index: HashMap::new(),
+            index: HashMap::default(),
             counts: MapCounts::default(),
         }
     }
@@ -177,17 +179,18 @@ impl VoxelMap {
         MapCloud::from_cells(self.origin(), self.voxel_m, &self.cells)
     }
 
-    /// Gives up the least confident cells; of equals, the one with the smaller key. Returns how many.
+    /// Gives up the least confident cells; of equals, the ones first in the list. Returns how many.
     fn evict(&mut self) -> u64 {
         let n = (self.cells.len() / EVICTED_PART).max(1);
-        let mut order: Vec<u32> = (0..self.cells.len() as u32).collect();
-        let rank = |&i: &u32| (self.cells[i as usize].weight.to_bits(), self.cells[i as usize].key);
-        // Positive floats order as their bits do.
-        order.select_nth_unstable_by_key(n - 1, rank);
+        // Positive floats order as their bits do, so weight and place fit in one number that is quick to compare.
+        let rank = |(i, c): (usize, &Cell)| u64::from(c.weight.to_bits()) << 32 | i as u64;
+        let mut order: Vec<u64> = self.cells.iter().enumerate().map(rank).collect();
+        order.select_nth_unstable(n - 1);
         order.truncate(n);
+        let mut places: Vec<u32> = order.into_iter().map(|r| r as u32).collect();
         // From the back, so that what moves into a hole is never itself about to go.
-        order.sort_unstable_by(|a, b| b.cmp(a));
-        for at in order {
+        places.sort_unstable_by(|a, b| b.cmp(a));
+        for at in places {
             let gone = self.cells.swap_remove(at as usize);
             self.index.remove(&gone.key);
             if let Some(moved) = self.cells.get(at as usize) {
