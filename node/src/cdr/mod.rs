@@ -10,3 +10,6 @@ pub mod schema;
 pub mod write;
 
 pub use read::CdrError;
+
+#[cfg(test)]
+mod round_trip;
