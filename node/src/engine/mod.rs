@@ -120,6 +120,11 @@ impl Engine {
         self.model.config()
     }
 
+    /// How scenes of this network are drawn.
+    pub fn raster_settings(&self) -> RasterSettings {
+        self.raster.settings().clone()
+    }
+
     /// Name of the weights file, or [`UNTRAINED`].
     pub fn weights(&self) -> &str {
         &self.weights

@@ -1,6 +1,6 @@
 //! From events to windows: synchronise, pose, window. Plain values in, plain values out; message time is the only clock.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use tracing::warn;
@@ -24,9 +24,6 @@ pub struct TruthImage {
     /// Values.
     pub data: Arc<Truth>,
 }
-
-/// Ground truth of one camera at one stamp, by kind.
-pub type TruthSet = BTreeMap<u8, TruthImage>;
 
 /// What the front half hands on.
 #[derive(Debug)]

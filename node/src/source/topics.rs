@@ -91,7 +91,7 @@ pub enum PoseTopic {
 }
 
 /// What a ground-truth topic holds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub enum TruthKind {
     /// z-depth, metres, 0 for sky.
     Depth,

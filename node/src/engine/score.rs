@@ -1,0 +1,377 @@
+//! Error figures of a run: frames that were not context are drawn at their own time and pose and compared with what the
+//! camera saw; where the recording has ground truth, depth and flow are compared too.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use anyhow::Result;
+use serde::Serialize;
+use storm_model::metrics;
+use storm_model::scene::{RenderedView, Want};
+use storm_render::Intrinsics;
+use storm_render::raster::{CpuRasterizer, RasterSettings};
+
+use crate::engine::views_of;
+use crate::pipeline::front::TruthImage;
+use crate::pipeline::step::Step;
+use crate::source::event::Truth;
+use crate::source::topics::TruthKind;
+use crate::source::{Frame, Rig};
+use crate::window::PosedSet;
+
+/// Sets and ground truth are kept this long beyond the oldest window that still waits to be scored, seconds.
+const KEEP_SEC: f64 = 2.0;
+
+/// A running mean of what could be computed.
+#[derive(Debug, Clone, Copy, Default)]
+struct Mean {
+    sum: f64,
+    n: u64,
+}
+
+impl Mean {
+    fn add(&mut self, x: Option<f64>) {
+        if let Some(x) = x.filter(|x| x.is_finite()) {
+            self.sum += x;
+            self.n += 1;
+        }
+    }
+
+    fn get(&self) -> Option<f64> {
+        (self.n > 0).then(|| self.sum / self.n as f64)
+    }
+}
+
+/// Figures of one method; `None` where nothing could be compared. Definitions: `storm_model::metrics`.
+#[derive(Debug, Clone, Default, Serialize, PartialEq)]
+pub struct Figures {
+    /// dB, mean over images, without sky where the sky is known.
+    pub psnr: Option<f64>,
+    /// dB, moving pixels only.
+    pub psnr_dynamic: Option<f64>,
+    /// Structural similarity, without sky where the sky is known.
+    pub ssim: Option<f64>,
+    /// Structural similarity, moving pixels only.
+    pub ssim_dynamic: Option<f64>,
+    /// z-depth, metres.
+    pub depth_rmse: Option<f64>,
+    /// z-depth of moving pixels, metres.
+    pub depth_rmse_dynamic: Option<f64>,
+    /// End-point error of the flow on the newest context frames, m/s.
+    pub epe3d: Option<f64>,
+    /// Share of points within 0.05 m/s or 5 %, 0 to 1.
+    pub acc5: Option<f64>,
+    /// Share of points within 0.1 m/s or 10 %, 0 to 1.
+    pub acc10: Option<f64>,
+    /// Mean angle between true and predicted flow of moving points, radians.
+    pub theta: Option<f64>,
+}
+
+/// Error figures of a run.
+#[derive(Debug, Clone, Serialize, PartialEq)]
+pub struct Scores {
+    /// Images compared.
+    pub images: u64,
+    /// This program.
+    pub storm: Figures,
+    /// Showing the same camera's nearest context image instead: what a network has to beat.
+    pub nearest_context: Figures,
+}
+
+impl Scores {
+    /// Name, unit, higher is better, and both methods' values.
+    pub fn rows(&self) -> Vec<(&'static str, &'static str, bool, [Option<f64>; 2])> {
+        let (a, b) = (&self.storm, &self.nearest_context);
+        let rows = vec![
+            ("PSNR", "dB", true, [a.psnr, b.psnr]),
+            ("PSNR, moving", "dB", true, [a.psnr_dynamic, b.psnr_dynamic]),
+            ("SSIM", "", true, [a.ssim, b.ssim]),
+            ("SSIM, moving", "", true, [a.ssim_dynamic, b.ssim_dynamic]),
+            ("depth RMSE", "m", false, [a.depth_rmse, b.depth_rmse]),
+            ("depth RMSE, moving", "m", false, [a.depth_rmse_dynamic, b.depth_rmse_dynamic]),
+            ("EPE3D", "m/s", false, [a.epe3d, b.epe3d]),
+            ("Acc5", "", true, [a.acc5, b.acc5]),
+            ("Acc10", "", true, [a.acc10, b.acc10]),
+            ("angle", "rad", false, [a.theta, b.theta]),
+        ];
+        rows.into_iter().filter(|(_, _, _, v)| v.iter().any(Option::is_some)).collect()
+    }
+
+    /// One line for the terminal.
+    pub fn line(&self) -> String {
+        let text = |x: Option<f64>| x.map_or("-".to_string(), |x| format!("{x:.2}"));
+        format!(
+            "held-out images: {}; PSNR {} dB (nearest context image {} dB), SSIM {}, depth RMSE {} m, EPE3D {} m/s",
+            self.images,
+            text(self.storm.psnr),
+            text(self.nearest_context.psnr),
+            text(self.storm.ssim),
+            text(self.storm.depth_rmse),
+            text(self.storm.epe3d),
+        )
+    }
+}
+
+#[derive(Default)]
+struct Totals {
+    psnr: Mean,
+    psnr_dynamic: Mean,
+    ssim: Mean,
+    ssim_dynamic: Mean,
+    depth: Mean,
+    depth_dynamic: Mean,
+    epe3d: Mean,
+    acc5: Mean,
+    acc10: Mean,
+    theta: Mean,
+}
+
+impl Totals {
+    fn figures(&self) -> Figures {
+        Figures {
+            psnr: self.psnr.get(),
+            psnr_dynamic: self.psnr_dynamic.get(),
+            ssim: self.ssim.get(),
+            ssim_dynamic: self.ssim_dynamic.get(),
+            depth_rmse: self.depth.get(),
+            depth_rmse_dynamic: self.depth_dynamic.get(),
+            epe3d: self.epe3d.get(),
+            acc5: self.acc5.get(),
+            acc10: self.acc10.get(),
+            theta: self.theta.get(),
+        }
+    }
+
+    fn image(&mut self, pred01: &[f32], true01: &[f32], size: (usize, usize), truth: &TruthAt) {
+        let (w, h) = size;
+        let solid = truth.sky.as_ref().map(|sky| sky.iter().map(|&s| s == 0).collect::<Vec<bool>>());
+        self.psnr.add(metrics::image::psnr(pred01, true01, 3, solid.as_deref()));
+        self.ssim.add(metrics::image::ssim(pred01, true01, w, h, 3, solid.as_deref()));
+        if let Some(moving) = truth.moving_mask() {
+            self.psnr_dynamic.add(metrics::image::psnr(pred01, true01, 3, Some(&moving)));
+            self.ssim_dynamic.add(metrics::image::ssim(pred01, true01, w, h, 3, Some(&moving)));
+        }
+    }
+
+    fn depth(&mut self, view: &RenderedView, truth: &TruthAt) {
+        let Some(depth) = &truth.depth else { return };
+        let known: Vec<bool> = depth.iter().map(|&d| d > 0.0).collect();
+        self.depth.add(metrics::image::depth_rmse(&view.depth, depth, Some(&known)));
+        if let Some(moving) = truth.moving_mask() {
+            let both: Vec<bool> = known.iter().zip(&moving).map(|(a, b)| *a && *b).collect();
+            self.depth_dynamic.add(metrics::image::depth_rmse(&view.depth, depth, Some(&both)));
+        }
+    }
+}
+
+/// Ground truth of one picture, at the picture's size.
+#[derive(Default)]
+struct TruthAt {
+    depth: Option<Vec<f32>>,
+    flow: Option<Vec<[f32; 3]>>,
+    moving: Option<Vec<u16>>,
+    sky: Option<Vec<u16>>,
+}
+
+impl TruthAt {
+    fn moving_mask(&self) -> Option<Vec<bool>> {
+        self.moving.as_ref().map(|m| m.iter().map(|&x| x != 0).collect())
+    }
+}
+
+/// Scores steps as they come, each one step late, so that ground truth recorded after its images has arrived.
+pub struct Scorer {
+    raster: CpuRasterizer,
+    cameras: Vec<Intrinsics>,
+    frames_per_step: usize,
+    sets: VecDeque<Arc<PosedSet<Frame>>>,
+    truth: BTreeMap<(i64, usize, TruthKind), TruthImage>,
+    waiting: Option<Arc<Step>>,
+    images: u64,
+    ours: Totals,
+    nearest: Totals,
+}
+
+impl Scorer {
+    /// Draws with `settings`, at most `frames_per_step` held-out sets per step.
+    pub fn new(settings: RasterSettings, rig: &Rig, frames_per_step: usize) -> Result<Self> {
+        Ok(Self {
+            raster: CpuRasterizer::new(settings)?,
+            cameras: rig.intrinsics(),
+            frames_per_step,
+            sets: VecDeque::new(),
+            truth: BTreeMap::new(),
+            waiting: None,
+            images: 0,
+            ours: Totals::default(),
+            nearest: Totals::default(),
+        })
+    }
+
+    /// A set that may be held out of later windows.
+    pub fn set(&mut self, set: Arc<PosedSet<Frame>>) {
+        self.sets.push_back(set);
+    }
+
+    /// Ground truth.
+    pub fn truth(&mut self, camera: usize, stamp_ns: i64, kind: TruthKind, image: TruthImage) {
+        self.truth.insert((stamp_ns, camera, kind), image);
+    }
+
+    /// A step; scores the one before it.
+    pub fn step(&mut self, step: Arc<Step>) -> Result<()> {
+        if let Some(before) = self.waiting.replace(step) {
+            self.score(&before)?;
+            self.forget(before.window.steps.first().map_or(i64::MIN, |s| s.stamp_ns));
+        }
+        Ok(())
+    }
+
+    /// Scores what waits; `None` when nothing could be compared.
+    pub fn finish(mut self) -> Result<Option<Scores>> {
+        if let Some(last) = self.waiting.take() {
+            self.score(&last)?;
+        }
+        let any = self.images > 0 || self.ours.epe3d.n > 0;
+        Ok(any.then(|| Scores {
+            images: self.images,
+            storm: self.ours.figures(),
+            nearest_context: self.nearest.figures(),
+        }))
+    }
+
+    fn forget(&mut self, oldest_ns: i64) {
+        let limit = oldest_ns.saturating_sub((KEEP_SEC * 1e9) as i64);
+        while self.sets.front().is_some_and(|s| s.stamp_ns < limit) {
+            self.sets.pop_front();
+        }
+        self.truth = self.truth.split_off(&(limit, 0, TruthKind::Depth));
+    }
+
+    fn score(&mut self, step: &Step) -> Result<()> {
+        let window = &step.window;
+        let (Some(first), Some(last)) = (window.steps.first(), window.steps.last()) else { return Ok(()) };
+        let context = |stamp: i64| window.steps.iter().any(|s| s.stamp_ns == stamp);
+        let inside: Vec<Arc<PosedSet<Frame>>> = self
+            .sets
+            .iter()
+            .filter(|s| s.epoch == window.epoch && s.stamp_ns > first.stamp_ns && s.stamp_ns < last.stamp_ns)
+            .filter(|s| !context(s.stamp_ns))
+            .cloned()
+            .collect();
+        for set in spread(&inside, self.frames_per_step, step.index) {
+            self.score_set(step, set)?;
+        }
+        self.score_flow(step);
+        Ok(())
+    }
+
+    fn score_set(&mut self, step: &Step, set: &PosedSet<Frame>) -> Result<()> {
+        let first_ns = step.window.steps.first().map_or(set.stamp_ns, |s| s.stamp_ns);
+        for (camera, target) in views_of(set, &step.window.map_from_anchor, &self.cameras).into_iter().enumerate() {
+            let stamp_ns = set.frames[camera].stamp_ns;
+            // Each camera at its own stamp.
+            let time_sec = (stamp_ns.saturating_sub(first_ns) as f64 * 1e-9) as f32;
+            let views = step.scene.render(&mut self.raster, &[target], time_sec, Want { flow: false, motion: false })?;
+            let Some(view) = views.first() else { continue };
+            let size = (view.width, view.height);
+            let true01 = unit(&set.frames[camera].item.rgb.data);
+            let truth = self.truth_at(camera, stamp_ns, size);
+            self.ours.image(&unit(&view.rgb8()), &true01, size, &truth);
+            self.ours.depth(view, &truth);
+            if let Some(nearest) = nearest_context(step, camera, stamp_ns) {
+                self.nearest.image(&unit(nearest), &true01, size, &truth);
+            }
+            self.images += 1;
+        }
+        Ok(())
+    }
+
+    /// Rendered flow of the newest context frames against the truth, all cameras pooled, where depth is known.
+    fn score_flow(&mut self, step: &Step) {
+        let Some(newest) = step.window.steps.last() else { return };
+        let rotation = step.window.map_from_anchor.rotation.as_quat();
+        let (mut pred, mut label) = (Vec::new(), Vec::new());
+        for (camera, view) in step.views.iter().enumerate() {
+            let truth = self.truth_at(camera, newest.frames[camera].stamp_ns, (view.width, view.height));
+            let (Some(flow), Some(true_flow), Some(depth)) = (&view.flow, &truth.flow, &truth.depth) else { continue };
+            for p in (0..depth.len()).filter(|&p| depth[p] > 0.0) {
+                pred.push((rotation * glam::Vec3::from(flow[p])).to_array());
+                label.push(true_flow[p]);
+            }
+        }
+        if let Some(f) = metrics::flow::scene_flow(&pred, &label) {
+            self.ours.epe3d.add(Some(f.epe3d));
+            self.ours.acc5.add(Some(f.acc5));
+            self.ours.acc10.add(Some(f.acc10));
+            self.ours.theta.add(f.theta);
+        }
+    }
+
+    /// Ground truth at `size`, sampled at pixel centres.
+    fn truth_at(&self, camera: usize, stamp_ns: i64, size: (usize, usize)) -> TruthAt {
+        let mut at = TruthAt::default();
+        for kind in [TruthKind::Depth, TruthKind::Flow, TruthKind::Moving, TruthKind::Sky] {
+            let Some(image) = self.truth.get(&(stamp_ns, camera, kind)) else { continue };
+            match (&*image.data, kind) {
+                (Truth::Depth(d), _) => at.depth = sample(d, image, size),
+                (Truth::Flow(f), _) => at.flow = sample(f, image, size),
+                (Truth::Mask(m), TruthKind::Moving) => at.moving = sample(m, image, size),
+                (Truth::Mask(m), _) => at.sky = sample(m, image, size),
+            }
+        }
+        at
+    }
+}
+
+/// At most `limit` of `sets`, evenly spread; which ones turns with the step, so that a run covers all phases.
+fn spread(sets: &[Arc<PosedSet<Frame>>], limit: usize, step: u64) -> impl Iterator<Item = &PosedSet<Frame>> {
+    let n = sets.len();
+    let want = limit.min(n);
+    let shift = if n > 0 { step as usize % n } else { 0 };
+    (0..want).map(move |i| &*sets[(shift + i * n / want) % n])
+}
+
+/// The picture of `camera` in the window nearest in time.
+fn nearest_context(step: &Step, camera: usize, stamp_ns: i64) -> Option<&[u8]> {
+    let frames = step.window.steps.iter().filter_map(|s| s.frames.get(camera));
+    frames.min_by_key(|f| f.stamp_ns.abs_diff(stamp_ns)).map(|f| f.item.rgb.data.as_slice())
+}
+
+/// 8-bit values as 0 to 1.
+fn unit(bytes: &[u8]) -> Vec<f32> {
+    bytes.iter().map(|&b| b as f32 / 255.0).collect()
+}
+
+/// `data` at the centres of a `width x height` picture's pixels; `None` when its length does not fit its size.
+fn sample<T: Copy>(data: &[T], image: &TruthImage, (width, height): (usize, usize)) -> Option<Vec<T>> {
+    if data.len() != image.width * image.height || data.is_empty() {
+        return None;
+    }
+    let at = |i: usize, from: usize, to: usize| ((2 * i + 1) * from / (2 * to)).min(from - 1);
+    let pixel = |k: usize| data[at(k / width, image.height, height) * image.width + at(k % width, image.width, width)];
+    Some((0..width * height).map(pixel).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn truth_is_sampled_at_pixel_centres() {
+        let image = TruthImage { width: 4, height: 2, data: Arc::new(Truth::Mask(Vec::new())) };
+        assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (2, 1)), Some(vec![5, 7]));
+        assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (4, 2)), Some(vec![0, 1, 2, 3, 4, 5, 6, 7]));
+        assert_eq!(sample(&[0, 1], &image, (4, 2)), None);
+    }
+
+    #[test]
+    fn means_ignore_what_could_not_be_computed() {
+        let mut m = Mean::default();
+        assert_eq!(m.get(), None);
+        for x in [Some(1.0), None, Some(f64::NAN), Some(3.0)] {
+            m.add(x);
+        }
+        assert_eq!(m.get(), Some(2.0));
+    }
+}
