@@ -2,7 +2,7 @@
 
 use candle_core::{DType, Tensor};
 
-use super::params::Params;
+use super::params::{Arranged, Params};
 use super::resample::resample;
 use super::stages::Stages;
 use crate::clip::ClipBatch;
@@ -20,7 +20,8 @@ const TIME_PERIODS: f64 = 1e4;
 pub(crate) struct Embed {
     patch: usize,
     grid: (usize, usize),
-    proj: Linear,
+    proj: Arranged,
+    width: usize,
     position: Option<Tensor>,
     time: [Linear; 2],
 }
@@ -31,7 +32,8 @@ impl Embed {
         Ok(Self {
             patch: config.patch_size,
             grid: config.grid(),
-            proj: params.linear("patch_embed.proj")?,
+            proj: Arranged::new(params.linear("patch_embed.proj")?, patches_as_rows)?,
+            width: config.embed_dim,
             position,
             time: [params.linear("time_embedder.mlp.0")?, params.linear("time_embedder.mlp.2")?],
         })
@@ -40,7 +42,7 @@ impl Embed {
     /// `(b, t v rows cols, d)`.
     pub fn forward(&self, batch: &ClipBatch, rays: &Rays, stages: &mut Stages) -> Result<Tensor, ModelError> {
         let [b, t, v, h, w] = batch.dims()?;
-        let (p, d) = (self.patch, self.proj.weight.dim(0)?);
+        let (p, d) = (self.patch, self.width);
         let (rows, cols) = (h / p, w / p);
         let views = b * t * v;
         let pixels = Tensor::cat(&[&batch.image.reshape((views, 3, h, w))?, &rays.plucker], 1)?;
@@ -49,8 +51,7 @@ impl Embed {
             .permute(vec![0, 2, 4, 1, 3, 5])?
             .contiguous()?
             .reshape((views * rows * cols, ModelConfig::INPUT_CHANNELS * p * p))?;
-        let proj = Linear { weight: self.proj.weight.reshape((d, ()))?, bias: self.proj.bias.clone() };
-        let tokens = linear(&patches, &proj, Activation::None, None)?.reshape((views, rows * cols, d))?;
+        let tokens = linear(&patches, &self.proj.layer()?, Activation::None, None)?.reshape((views, rows * cols, d))?;
         if stages.wants("patch_embed") {
             stages.keep("patch_embed", &tokens.reshape((views, rows, cols, d))?);
         }
@@ -93,4 +94,10 @@ impl Embed {
         stages.keep("time_embed", &x);
         Ok(x)
     }
+}
+
+/// A convolution whose stride is its kernel: one row of weights per output channel over a flattened patch.
+fn patches_as_rows(conv: &Linear) -> candle_core::Result<Linear> {
+    let outputs = conv.weight.dim(0)?;
+    Ok(Linear::new(conv.weight.reshape((outputs, ()))?, conv.bias.clone()))
 }

@@ -1,13 +1,13 @@
 //! Motion tokens and mask decoder: velocities as a soft mixture of a few bases (paper section 3.1).
 
 use candle_core::{D, Tensor};
-use candle_nn::ops::softmax;
 
 use super::params::{Mlp, Params};
 use super::stages::Stages;
 use super::upsample::{Upsampler, unnest};
 use crate::config::{MaskDecoder, ModelConfig, VelocityKind};
 use crate::error::ModelError;
+use crate::ops::softmax;
 
 /// Velocities of every pixel and how they came about.
 pub(crate) struct Motion {
@@ -85,7 +85,7 @@ impl MotionHead {
                 Some((queries, bases)) => {
                     let window = picture / (t * v);
                     let logits = keys.matmul(&queries.get(window)?.t()?)?;
-                    let weights = softmax(&(logits / config.tau)?, D::Minus1)?;
+                    let weights = softmax(&logits, config.tau)?;
                     let velocity = weights.matmul(&bases.get(window)?)?;
                     all_weights.push(unnest(&weights, grid, levels)?);
                     velocity

@@ -18,8 +18,7 @@ impl Params<'_> {
     }
 
     pub fn linear(&self, name: &str) -> Result<Linear, ModelError> {
-        let weight = self.get(&format!("{name}.weight"))?;
-        Ok(Linear { weight, bias: Some(self.get(&format!("{name}.bias"))?) })
+        Ok(Linear::new(self.get(&format!("{name}.weight"))?, Some(self.get(&format!("{name}.bias"))?)))
     }
 
     pub fn norm(&self, name: &str) -> Result<Norm, ModelError> {
@@ -44,6 +43,32 @@ pub(crate) struct Norm {
 impl Norm {
     pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
         layer_norm(x, Some(&self.weight), Some(&self.bias), NORM_EPS)
+    }
+}
+
+/// A linear layer whose matrix is a stored weight in another arrangement (convolutions written as matrix products).
+///
+/// Arranged once, at loading, so that kernels can keep their own copy of it; but while the weight is a variable in
+/// training, at every use, so that it is followed and differentiated.
+#[derive(Debug, Clone)]
+pub(crate) struct Arranged {
+    stored: Linear,
+    arrange: fn(&Linear) -> candle_core::Result<Linear>,
+    ready: Option<Linear>,
+}
+
+impl Arranged {
+    pub fn new(stored: Linear, arrange: fn(&Linear) -> candle_core::Result<Linear>) -> candle_core::Result<Self> {
+        let variable = stored.weight.is_variable() || stored.bias.as_ref().is_some_and(Tensor::is_variable);
+        let ready = if variable { None } else { Some(arrange(&stored)?) };
+        Ok(Self { stored, arrange, ready })
+    }
+
+    pub fn layer(&self) -> candle_core::Result<Linear> {
+        match &self.ready {
+            Some(layer) => Ok(layer.clone()),
+            None => (self.arrange)(&self.stored),
+        }
     }
 }
 

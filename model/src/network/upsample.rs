@@ -6,17 +6,17 @@
 
 use candle_core::{Result, Tensor};
 
-use super::params::{Norm, Params};
+use super::params::{Arranged, Norm, Params};
 use super::stages::Stages;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, linear};
+use crate::ops::{Activation, Linear, gelu, linear};
 use crate::weights::names::upsampler_norm;
 
 #[derive(Debug, Clone)]
 struct Doubling {
-    /// `(in, out, 2, 2)`, as PyTorch's ConvTranspose2d stores it.
-    conv: Linear,
+    conv: Arranged,
+    width: usize,
     norm: Option<Norm>,
 }
 
@@ -24,47 +24,54 @@ struct Doubling {
 #[derive(Debug, Clone)]
 pub(crate) struct Upsampler(Vec<Doubling>);
 
-/// The same layers as matrices; made once per forward pass, so that weights in training are followed.
-pub(crate) struct Prepared(Vec<(Linear, usize, Option<Norm>)>);
+/// PyTorch's transposed convolution `(in, out, 2, 2)` as a matrix `(row bit, col bit, out; in)`.
+fn children_as_rows(conv: &Linear) -> Result<Linear> {
+    let (inputs, width, _, _) = conv.weight.dims4()?;
+    let weight = conv.weight.permute((2, 3, 1, 0))?.contiguous()?.reshape((4 * width, inputs))?;
+    let bias = match &conv.bias {
+        Some(bias) => Some(Tensor::cat(&[bias, bias, bias, bias], 0)?),
+        None => None,
+    };
+    Ok(Linear::new(weight, bias))
+}
+
+/// The layers of one forward pass.
+pub(crate) struct Prepared<'a>(Vec<(Linear, &'a Doubling)>);
 
 impl Upsampler {
     pub fn new(config: &ModelConfig, params: &Params<'_>) -> std::result::Result<Self, ModelError> {
-        let stage = |k: usize| {
+        let stage = |(k, &width): (usize, &usize)| {
             let norm = upsampler_norm(config, k).then(|| params.norm(&format!("output_upscaling.{}", 3 * k + 1)));
             let conv = params.linear(&format!("output_upscaling.{}", 3 * k))?;
-            Ok::<_, ModelError>(Doubling { conv, norm: norm.transpose()? })
+            Ok::<_, ModelError>(Doubling {
+                conv: Arranged::new(conv, children_as_rows)?,
+                width,
+                norm: norm.transpose()?,
+            })
         };
-        Ok(Self((0..config.upsampler_widths.len()).map(stage).collect::<std::result::Result<_, _>>()?))
+        Ok(Self(config.upsampler_widths.iter().enumerate().map(stage).collect::<std::result::Result<_, _>>()?))
     }
 
-    pub fn prepare(&self) -> Result<Prepared> {
-        let prepare = |stage: &Doubling| {
-            let (inputs, width, _, _) = stage.conv.weight.dims4()?;
-            let weight = stage.conv.weight.permute((2, 3, 1, 0))?.contiguous()?.reshape((4 * width, inputs))?;
-            let bias = match &stage.conv.bias {
-                Some(bias) => Some(Tensor::cat(&[bias, bias, bias, bias], 0)?),
-                None => None,
-            };
-            Ok((Linear { weight, bias }, width, stage.norm.clone()))
-        };
-        Ok(Prepared(self.0.iter().map(prepare).collect::<Result<_>>()?))
+    /// Once per forward pass, before the first picture.
+    pub fn prepare(&self) -> Result<Prepared<'_>> {
+        Ok(Prepared(self.0.iter().map(|stage| Ok((stage.conv.layer()?, stage))).collect::<Result<_>>()?))
     }
 }
 
-impl Prepared {
+impl Prepared<'_> {
     /// `(patches, d)` of one picture to `(patches * 4^stages, width)` in nested order.
     ///
-    /// `grid` is used only to name the stages kept for comparison.
+    /// `grid` is used only to arrange the stages kept for comparison.
     pub fn forward(&self, patches: &Tensor, grid: (usize, usize), stages: &mut Stages) -> Result<Tensor> {
         let mut x = patches.clone();
-        for (k, (layer, width, norm)) in self.0.iter().enumerate() {
+        for (k, (layer, Doubling { width, norm, .. })) in self.0.iter().enumerate() {
             x = linear(&x, layer, Activation::None, None)?.reshape(((), *width))?;
             keep(stages, 3 * k, &x, grid, k + 1)?;
             if let Some(norm) = norm {
                 x = norm.forward(&x)?;
                 keep(stages, 3 * k + 1, &x, grid, k + 1)?;
             }
-            x = x.gelu_erf()?;
+            x = gelu(&x)?;
             keep(stages, 3 * k + 2, &x, grid, k + 1)?;
         }
         Ok(x)
@@ -109,10 +116,16 @@ mod tests {
         let w1 = Tensor::from_vec(wave(d * c1 * 4, 0.31), (d, c1, 2, 2), &device).unwrap();
         let w2 = Tensor::from_vec(wave(c1 * c2 * 4, 0.17), (c1, c2, 2, 2), &device).unwrap();
         let layer = |w: &Tensor, c: usize| Doubling {
-            conv: Linear { weight: w.clone(), bias: Some(Tensor::zeros(c, DType::F32, &device).unwrap()) },
+            conv: Arranged::new(
+                Linear::new(w.clone(), Some(Tensor::zeros(c, DType::F32, &device).unwrap())),
+                children_as_rows,
+            )
+            .unwrap(),
+            width: c,
             norm: None,
         };
-        let prepared = Upsampler(vec![layer(&w1, c1), layer(&w2, c2)]).prepare().unwrap();
+        let upsampler = Upsampler(vec![layer(&w1, c1), layer(&w2, c2)]);
+        let prepared = upsampler.prepare().unwrap();
         let ours = prepared.forward(&x, (rows, cols), &mut Stages::none()).unwrap();
         let ours = unnest(&ours, (rows, cols), 2).unwrap();
         let chw = x.reshape((1, rows, cols, d)).unwrap().permute((0, 3, 1, 2)).unwrap().contiguous().unwrap();
