@@ -5,8 +5,8 @@ use glam::{DQuat, DVec3};
 use crate::poses::{PoseReject, checked};
 use crate::rigid::Rigid;
 
-/// A mounting as the configuration writes it: x y z in metres, then the quaternion w x y z; the camera's optical frame in
-/// the vehicle frame.
+/// A mounting as the configuration writes it: x y z in metres, then the quaternion w x y z; the camera's optical frame
+/// in the vehicle frame.
 pub fn base_from_camera(numbers: &[f64; 7]) -> Result<Rigid, PoseReject> {
     let &[x, y, z, qw, qx, qy, qz] = numbers;
     checked(&Rigid::new(DQuat::from_xyzw(qx, qy, qz, qw), DVec3::new(x, y, z))).map(|(mount, _)| mount)

@@ -44,7 +44,7 @@ section! {
     pub struct SyncConfig {
         /// Largest distance of an image's stamp from the set's reference stamp, seconds.
         slop_sec: f64 = 0.02,
-        /// How long a set waits for its missing cameras, seconds of message time.
+        /// How long an image waits for the other cameras' after it came in, seconds of message time.
         timeout_sec: f64 = 0.25,
         /// How long a set waits for a pose after its newest image, seconds of message time.
         pose_wait_sec: f64 = 0.5,

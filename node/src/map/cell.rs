@@ -2,8 +2,8 @@
 
 use glam::{Mat3, Quat, Vec3};
 
-/// A cell's weight stops growing here: f32 still tells a new observation of weight 1e-4 apart from none at this size, and a place
-/// seen for hours can still change.
+/// A cell's weight stops growing here: f32 still tells a new observation of weight 1e-4 apart from none at this size,
+/// and a place seen for hours can still change.
 const MAX_WEIGHT: f32 = 1e3;
 
 /// What one Gaussian brings, in map axes.
@@ -36,8 +36,8 @@ impl Cell {
         Self { key, weight: s.weight.min(MAX_WEIGHT), offset: s.offset, color: s.color, opacity: s.opacity, cov: s.cov }
     }
 
-    /// Moment matching of the mixture so far with one more component: with share `a` of the weight and the means `d` apart,
-    /// mean += a d, and cov = (1 - a) cov + a cov_new + a (1 - a) d d^T.
+    /// Moment matching of the mixture so far with one more component: with share `a` of the weight and the means `d`
+    /// apart, mean += a d, and cov = (1 - a) cov + a cov_new + a (1 - a) d d^T.
     pub fn merge(&mut self, s: &Sample) {
         let total = self.weight + s.weight;
         let a = s.weight / total;

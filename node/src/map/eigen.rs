@@ -2,7 +2,8 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// Sweeps over the three off-diagonal elements. Convergence is quadratic: six reach f64 precision from any start, the rest is margin.
+/// Sweeps over the three off-diagonal elements. Convergence is quadratic: six reach f64 precision from any start, the
+/// rest is margin.
 const MAX_SWEEPS: usize = 12;
 
 /// Off-diagonal part, relative to the whole, that counts as zero: below f64's resolution of the squares.
@@ -92,7 +93,8 @@ mod tests {
     proptest! {
         #[test]
         fn the_parts_multiply_back(
-            a in -3.2f64..3.2, b in -1.6f64..1.6, c in -3.2f64..3.2, s in proptest::array::uniform3(-4.0f64..2.0), same in any::<bool>(),
+            a in -3.2f64..3.2, b in -1.6f64..1.6, c in -3.2f64..3.2,
+            s in proptest::array::uniform3(-4.0f64..2.0), same in any::<bool>(),
         ) {
             let s = DVec3::from(s.map(|x| 10f64.powf(x)));
             let s = if same { DVec3::new(s.x, s.x, s.z) } else { s };

@@ -1,5 +1,5 @@
-//! A hash for voxel indices. The standard one guards against chosen keys, which costs half of an insertion here; the order of the
-//! table never shows in the map.
+//! A hash for voxel indices. The standard one guards against chosen keys, which costs half of an insertion here; the
+//! order of the table never shows in the map.
 
 use std::hash::{BuildHasherDefault, Hasher};
 
@@ -18,7 +18,8 @@ impl Hasher for VoxelHasher {
         for chunk in bytes.chunks(8) {
             let mut word = [0; 8];
             word[..chunk.len()].copy_from_slice(chunk);
-            // The high half of the product holds the mixed bits; folding it in brings them down to where the table looks.
+            // The high half of the product holds the mixed bits; folding it in brings them down to where the table
+            // looks.
             let product = u128::from(self.0 ^ u64::from_le_bytes(word)) * u128::from(SPREAD);
             self.0 = (product as u64) ^ ((product >> 64) as u64).rotate_left(23);
         }

@@ -1,7 +1,7 @@
 //! The long-horizon map: static Gaussians merged in voxels.
 //!
-//! One Gaussian per voxel, by confidence-weighted moment matching of all that fell into it. Positions are kept relative to
-//! their voxel and voxels relative to an f64 origin, so the size of map coordinates does not matter.
+//! One Gaussian per voxel, by confidence-weighted moment matching of all that fell into it. Positions are kept relative
+//! to their voxel and voxels relative to an f64 origin, so the size of map coordinates does not matter.
 
 mod cell;
 mod cloud;
@@ -22,8 +22,8 @@ pub use cloud::MapCloud;
 use hash::VoxelHash;
 pub use select::{color01, confidence, static_weight};
 
-/// Part of a full map that goes at once when it is full: few enough to be a small loss, enough that finding them is paid for by
-/// many insertions.
+/// Part of a full map that goes at once when it is full: few enough to be a small loss, enough that finding them is
+/// paid for by many insertions.
 const EVICTED_PART: usize = 64;
 
 /// Standard deviations beyond this are no surface but a mistake, metres (and their squares stay far inside f32).
@@ -63,7 +63,8 @@ impl MapCounts {
     }
 }
 
-/// The map. Bounded by `map.max_gaussians`; its content depends on what was inserted in which order, and on nothing else.
+/// The map. Bounded by `map.max_gaussians`; its content depends on what was inserted in which order, and on nothing
+/// else.
 #[derive(Debug)]
 pub struct VoxelMap {
     voxel_m: f64,
@@ -96,15 +97,17 @@ impl VoxelMap {
         free
     }
 
-    /// What positions of [`VoxelMap::cloud`] are relative to, in the map frame, metres; zero before the first insertion.
+    /// What positions of [`VoxelMap::cloud`] are relative to, in the map frame, metres; zero before the first
+    /// insertion.
     pub fn origin(&self) -> DVec3 {
         self.origin.unwrap_or(DVec3::ZERO)
     }
 
     /// Merges Gaussians of one window, given in its anchor frame.
     ///
-    /// `select(i)` gives Gaussian `i`'s confidence, or none to leave it out (see [`static_weight`]); `color(i)` its colour, 0 to
-    /// 1, already corrected for its camera's exposure (see [`color01`]). What is not finite is left out and counted.
+    /// `select(i)` gives Gaussian `i`'s confidence, or none to leave it out (see [`static_weight`]); `color(i)` its
+    /// colour, 0 to 1, already corrected for its camera's exposure (see [`color01`]). What is not finite is left out
+    /// and counted.
     pub fn insert(
         &mut self,
         map_from_anchor: &Rigid,

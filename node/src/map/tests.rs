@@ -214,8 +214,8 @@ fn rate() {
         let (cloud_ms, mb) = (start.elapsed().as_secs_f64() * 1e3, map.bytes() as f64 / 1e6);
         let [least, p50, p90, worst] = [0, 50, 90, 99].map(|i| times_ms[i]);
         println!(
-            "insert 40,000, {name}: least {least:.1}, p50 {p50:.1}, p90 {p90:.1}, worst {worst:.1} ms; {n} cells, {mb:.0} MB, \
-             cloud {cloud_ms:.0} ms; {:?}",
+            "insert 40,000, {name}: least {least:.1}, p50 {p50:.1}, p90 {p90:.1}, worst {worst:.1} ms; {n} cells, \
+             {mb:.0} MB, cloud {cloud_ms:.0} ms; {:?}",
             map.counts(),
         );
     }
@@ -232,7 +232,8 @@ proptest! {
         let c = map.cloud();
         prop_assert_eq!(c.len(), 1);
         let total: f64 = g.opacities.iter().map(|&w| f64::from(w)).sum();
-        let mean_of = |f: &dyn Fn(usize) -> DVec3| (0..n).map(|i| f(i) * f64::from(g.opacities[i])).sum::<DVec3>() / total;
+        let weighted = |f: &dyn Fn(usize) -> DVec3, i: usize| f(i) * f64::from(g.opacities[i]);
+        let mean_of = |f: &dyn Fn(usize) -> DVec3| (0..n).map(|i| weighted(f, i)).sum::<DVec3>() / total;
         let position = |i: usize| DVec3::from(g.means[i].map(f64::from));
         let mean = mean_of(&position);
         let mut cov = DMat3::ZERO;

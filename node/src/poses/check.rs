@@ -5,12 +5,12 @@ use thiserror::Error;
 
 use crate::rigid::{Rigid, UNIT_QUAT_TOLERANCE};
 
-/// Squared-norm deviation beyond which a quaternion is refused. Rounding to two decimals stays below it; a quaternion that is
-/// not filled in (all zero) or holds something else (Euler angles, w and x swapped with a length) does not.
+/// Squared-norm deviation beyond which a quaternion is refused. Rounding to two decimals stays below it; a quaternion
+/// that is not filled in (all zero) or holds something else (Euler angles, w and x swapped with a length) does not.
 pub const REFUSE_QUAT_TOLERANCE: f64 = 0.1;
 
-/// Positions beyond this are refused, metres: farther than any Earth-fixed frame reaches, and small enough that f64 still
-/// resolves a micrometre.
+/// Positions beyond this are refused, metres: farther than any Earth-fixed frame reaches, and small enough that f64
+/// still resolves a micrometre.
 pub const MAX_POSITION_M: f64 = 1e9;
 
 /// What was done with a pose that was not refused.

@@ -12,7 +12,8 @@ pub use timeline::{PoseLookup, PoseMissing};
 use crate::config::SyncConfig;
 use crate::rigid::Rigid;
 
-/// Poses kept: a quarter of an hour at 100 Hz, some 8 MB. Recordings that hold all poses before all images are read within it.
+/// Poses kept: a quarter of an hour at 100 Hz, some 8 MB. Recordings that hold all poses before all images are read
+/// within it.
 const MAX_POSES: usize = 100_000;
 
 /// The vehicle's poses, `map_from_base`, by stamp.

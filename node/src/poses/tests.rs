@@ -119,10 +119,12 @@ fn sets_wait_for_poses_but_not_for_ever() {
 }
 
 proptest! {
-    /// Any order of arrival gives the same poses, and between two poses all is smooth and unit length, at UTM-sized places too.
+    /// Any order of arrival gives the same poses, and between two poses all is smooth and unit length, at UTM-sized
+    /// places too.
     #[test]
     fn order_of_arrival_does_not_matter(
-        mut order in Just((0..20i64).collect::<Vec<_>>()).prop_shuffle(), start_ns in 0i64..(1 << 62), at in 0.0f64..1.0, yaw in -3.0f64..3.0,
+        mut order in Just((0..20i64).collect::<Vec<_>>()).prop_shuffle(),
+        start_ns in 0i64..(1 << 62), at in 0.0f64..1.0, yaw in -3.0f64..3.0,
     ) {
         let make = |order: &[i64]| {
             let mut b = buffer();

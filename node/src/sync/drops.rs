@@ -9,7 +9,7 @@ use serde::Serialize;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DropReason {
-    /// Older than a set that was already emitted, or than the sync timeout.
+    /// Older than a set that was already emitted.
     Late,
     /// A second image of one camera with the same stamp.
     Duplicate,
@@ -21,7 +21,8 @@ pub enum DropReason {
     PoseGap,
     /// No usable intrinsics or mounting for its camera.
     NoCalibration,
-    /// Held when the clock jumped, the recording looped, or the stage was reset; or its own stamp is far from all others.
+    /// Held when the clock jumped, the recording looped, or the stage was reset; or its own stamp is far from all
+    /// others.
     ClockJump,
     /// Its bytes cannot be decoded.
     Decode,

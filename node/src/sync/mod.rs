@@ -24,12 +24,20 @@ pub struct FrameSet<T> {
     pub frames: Vec<(i64, T)>,
 }
 
+#[derive(Debug)]
+struct Waiting<T> {
+    /// Message time when it came in.
+    since_ns: i64,
+    item: T,
+}
+
 /// Brings images together, one per camera; no threads and no clock of its own.
 ///
-/// Rule: a set is one image per camera, all within `slop_sec` of the reference, which is the stamp of one of them. It is
-/// emitted the moment its last image arrives. Where that image allows several sets, the one with the smallest sum of
-/// distances to its reference is taken, then the older reference. Reference stamps rise strictly within an epoch, and so do the stamps
-/// of each camera; what is left behind an emitted set is dropped as incomplete. Images may arrive out of order.
+/// Rule: a set is one image per camera, all within `slop_sec` of the reference, which is the stamp of one of them. It
+/// is emitted the moment its last image arrives. Where that image allows several sets, the one with the smallest sum of
+/// distances to its reference is taken, then the older reference. Reference stamps rise strictly within an epoch, and
+/// so do the stamps of each camera; what is left behind an emitted set is dropped as incomplete. Images may arrive out
+/// of order.
 ///
 /// Every image that came in is in a set, in [`Synchronizer::drops`] or in [`Synchronizer::pending`], exactly once.
 #[derive(Debug)]
@@ -39,7 +47,7 @@ pub struct Synchronizer<T> {
     max_pending: usize,
     offsets_ns: Vec<i64>,
     /// Per camera, images that wait for the others, by stamp.
-    waiting: Vec<BTreeMap<i64, T>>,
+    waiting: Vec<BTreeMap<i64, Waiting<T>>>,
     /// Per camera, the stamp in the newest set.
     used_ns: Vec<Option<i64>>,
     reference_ns: Option<i64>,
@@ -95,18 +103,20 @@ impl<T> Synchronizer<T> {
     }
 
     /// Message time is now `now_ns` (the newest stamp of any input): images that waited longer than `timeout_sec` are
-    /// dropped. A time of another time base than the images' is ignored.
+    /// dropped. The wait counts from the message time an image came in at, so that images which all come late, behind
+    /// other inputs, are not lost. A time of another time base than the images' is ignored.
     pub fn advance(&mut self, now_ns: i64) {
-        if !self.clock.newest_ns().is_some_and(|newest_ns| self.clock.near(newest_ns, now_ns)) {
+        let newest_ns = self.clock.newest_ns().unwrap_or(now_ns);
+        if !self.clock.near(newest_ns, now_ns) {
             return;
         }
-        self.now_ns = Some(self.now_ns.map_or(now_ns, |before_ns| before_ns.max(now_ns)));
-        if let Some(limit_ns) = self.now_ns.map(|now_ns| now_ns.saturating_sub(self.timeout_ns)) {
-            for waiting in &mut self.waiting {
-                let kept = waiting.split_off(&limit_ns);
-                self.drops.add(DropReason::Incomplete, waiting.len() as u64);
-                *waiting = kept;
-            }
+        let before_ns = self.now_ns.filter(|&before_ns| self.clock.near(newest_ns, before_ns));
+        let now_ns = before_ns.map_or(now_ns, |before_ns| before_ns.max(now_ns));
+        self.now_ns = Some(now_ns);
+        for waiting in &mut self.waiting {
+            let before = waiting.len();
+            waiting.retain(|_, w| w.since_ns.saturating_add(self.timeout_ns) >= now_ns);
+            self.drops.add(DropReason::Incomplete, (before - waiting.len()) as u64);
         }
     }
 
@@ -178,11 +188,13 @@ impl<T> Synchronizer<T> {
             self.drops.add(DropReason::Duplicate, 1);
             return;
         }
-        if self.floor_ns(camera).is_some_and(|floor_ns| stamp_ns <= floor_ns) || self.timed_out(stamp_ns) {
+        if self.floor_ns(camera).is_some_and(|floor_ns| stamp_ns <= floor_ns) {
             self.drops.add(DropReason::Late, 1);
             return;
         }
-        self.waiting[camera].insert(stamp_ns, item);
+        let now_ns = self.now_ns.filter(|&now_ns| self.clock.near(stamp_ns, now_ns));
+        let since_ns = now_ns.map_or(stamp_ns, |now_ns| now_ns.max(stamp_ns));
+        self.waiting[camera].insert(stamp_ns, Waiting { since_ns, item });
         // Only sets with this image can be new: any other would have been emitted when its own last image came.
         if let Some((reference_ns, picks_ns)) = self.best_set(stamp_ns) {
             self.emit(reference_ns, &picks_ns);
@@ -197,13 +209,6 @@ impl<T> Synchronizer<T> {
         let behind_ns = i64::try_from(self.slop_ns).unwrap_or(i64::MAX);
         let by_reference_ns = self.reference_ns.map(|r| r.saturating_sub(behind_ns));
         self.used_ns[camera].max(by_reference_ns)
-    }
-
-    /// True for an image so old that everything it could be matched with has timed out.
-    fn timed_out(&self, stamp_ns: i64) -> bool {
-        let slop_ns = i64::try_from(self.slop_ns).unwrap_or(i64::MAX);
-        let limit_ns = self.now_ns.map(|n| n.saturating_sub(self.timeout_ns).saturating_sub(slop_ns));
-        limit_ns.is_some_and(|limit_ns| stamp_ns < limit_ns)
     }
 
     /// The best set that has a reference within slop of `stamp_ns`: reference stamp and one stamp per camera.
@@ -226,7 +231,7 @@ impl<T> Synchronizer<T> {
     }
 
     /// The stamp nearest to the reference within slop; the older of two equally near.
-    fn nearest(&self, waiting: &BTreeMap<i64, T>, reference_ns: i64) -> Option<i64> {
+    fn nearest(&self, waiting: &BTreeMap<i64, Waiting<T>>, reference_ns: i64) -> Option<i64> {
         let before = waiting.range(..=reference_ns).next_back().map(|(&s, _)| s);
         let after = waiting.range(reference_ns..).next().map(|(&s, _)| s);
         let distance = |s: &i64| s.abs_diff(reference_ns);
@@ -237,8 +242,8 @@ impl<T> Synchronizer<T> {
         self.reference_ns = Some(reference_ns);
         let mut frames = Vec::with_capacity(picks_ns.len());
         for (camera, &pick_ns) in picks_ns.iter().enumerate() {
-            if let Some(item) = self.waiting[camera].remove(&pick_ns) {
-                frames.push((pick_ns, item));
+            if let Some(waiting) = self.waiting[camera].remove(&pick_ns) {
+                frames.push((pick_ns, waiting.item));
             }
             self.used_ns[camera] = Some(pick_ns);
         }

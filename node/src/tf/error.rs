@@ -60,7 +60,7 @@ pub enum TfProblem {
     },
     /// The frames are in separate trees.
     #[error(
-        "frames `{target_frame}` and `{source_frame}` are not connected (their roots are `{target_root}` and `{source_root}`)"
+        "frames `{target_frame}` and `{source_frame}` are not connected (roots `{target_root}` and `{source_root}`)"
     )]
     NotConnected {
         /// Asked for.

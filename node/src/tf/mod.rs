@@ -82,7 +82,8 @@ impl TfTree {
         Self { sync: config.clone(), frames: Vec::new(), by_name: BTreeMap::new() }
     }
 
-    /// Takes one transform; a leading `/` of frame names does not count. A transform from /tf_static holds at every stamp.
+    /// Takes one transform; a leading `/` of frame names does not count. A transform from /tf_static holds at every
+    /// stamp.
     pub fn insert(&mut self, message: &TransformStamped, is_static: bool) -> Result<PoseNote, TfError> {
         let (parent, child) = (bare(&message.header.frame_id), bare(&message.child_frame_id));
         if parent.is_empty() || child.is_empty() {
@@ -118,8 +119,8 @@ impl TfTree {
         }
     }
 
-    /// `target_from_source` at a stamp, along the parents both have in common; moving transforms are interpolated, never
-    /// extrapolated.
+    /// `target_from_source` at a stamp, along the parents both have in common; moving transforms are interpolated,
+    /// never extrapolated.
     pub fn lookup(&self, target: &str, source: &str, stamp_ns: i64) -> TfLookup {
         let (target, source) = (bare(target), bare(source));
         let index = |name: &str| self.by_name.get(name).copied();

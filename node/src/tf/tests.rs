@@ -110,7 +110,10 @@ proptest! {
     /// Any tree gives the product along the path, both ways, to f64 precision at UTM-sized places.
     #[test]
     fn lookups_agree_with_plain_products(
-        links in proptest::collection::vec((0usize..100, -3.0f64..3.0, -3.0f64..3.0, -1e6f64..1e6, -50.0f64..50.0), 1..12), a in 0usize..12, b in 0usize..12,
+        links in proptest::collection::vec(
+            (0usize..100, -3.0f64..3.0, -3.0f64..3.0, -1e6f64..1e6, -50.0f64..50.0), 1..12,
+        ),
+        a in 0usize..12, b in 0usize..12,
     ) {
         let mut t = tree();
         let mut root_from = vec![Rigid::IDENTITY];
@@ -123,7 +126,8 @@ proptest! {
         let (a, b) = (a % root_from.len(), b % root_from.len());
         let TfLookup::At(a_from_b) = t.lookup(&format!("f{a}"), &format!("f{b}"), 0) else { panic!() };
         let expected = root_from[a].inverse() * root_from[b];
-        // Up to a dozen products of positions of 1e6 m, each rounded at 1e-10 m and turned by rotations rounded at 1e-16.
+        // Up to a dozen products of positions of 1e6 m, each rounded at 1e-10 m and turned by rotations rounded at
+        // 1e-16.
         prop_assert!((a_from_b.translation - expected.translation).length() < 1e-7);
         prop_assert!(a_from_b.rotation.dot(expected.rotation).abs() > 1.0 - 1e-12);
         let TfLookup::At(b_from_a) = t.lookup(&format!("f{b}"), &format!("f{a}"), 0) else { panic!() };

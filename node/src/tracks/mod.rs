@@ -1,9 +1,10 @@
 //! Point trajectories chained from scene flow (paper, appendix "Point trajectory estimation").
 //!
-//! Each live trajectory's end is moved by its own flow to the time of the new step; each new moving Gaussian is connected to
-//! the nearest such place, and so on from step to step. Beyond the paper: the connection has a distance gate and is one-to-one
-//! (mutually nearest); a trajectory may miss its Gaussian for a short while and coasts on its flow meanwhile; new ones start at
-//! moving Gaussians that none passes by, spaced so that one patch of surface does not start many.
+//! Each live trajectory's end is moved by its own flow to the time of the new step; each new moving Gaussian is
+//! connected to the nearest such place, and so on from step to step. Beyond the paper: the connection has a distance
+//! gate and is one-to-one (mutually nearest); a trajectory may miss its Gaussian for a short while and coasts on its
+//! flow meanwhile; new ones start at moving Gaussians that none passes by, spaced so that one patch of surface does not
+//! start many.
 
 mod nearest;
 mod spacing;
@@ -16,8 +17,8 @@ use crate::sync::clock::seconds_between;
 use nearest::mutual_nearest;
 use spacing::Spacing;
 
-/// A trajectory ends after this many points, so that memory stays bounded behind a lead vehicle that never leaves: a quarter of an
-/// hour at 10 Hz.
+/// A trajectory ends after this many points, so that memory stays bounded behind a lead vehicle that never leaves: a
+/// quarter of an hour at 10 Hz.
 const MAX_POINTS: usize = 10_000;
 
 /// Speeds beyond this are a mistake of the network, m/s; the Gaussian is left out and counted.

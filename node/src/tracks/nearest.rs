@@ -21,8 +21,8 @@ impl Tree {
     }
 }
 
-/// For every observed place, the predicted one it continues: the nearest one, if it lies within `gate_m` and if the observed place
-/// is in turn the nearest to it. So no prediction is used twice.
+/// For every observed place, the predicted one it continues: the nearest one, if it lies within `gate_m` and if the
+/// observed place is in turn the nearest to it. So no prediction is used twice.
 pub(super) fn mutual_nearest(predicted: &[DVec3], observed: &[DVec3], gate_m: f64) -> Vec<Option<usize>> {
     let none = vec![None; observed.len()];
     // Relative to one of the points: squares of UTM-sized coordinates would lose the centimetres.
@@ -76,7 +76,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn agrees_with_comparing_every_pair(predicted in points(0..60), observed in points(0..200), gate_m in 0.1f64..3.0) {
+        fn agrees_with_comparing_every_pair(
+            predicted in points(0..60), observed in points(0..200), gate_m in 0.1f64..3.0,
+        ) {
             prop_assert_eq!(mutual_nearest(&predicted, &observed, gate_m), brute(&predicted, &observed, gate_m));
         }
     }

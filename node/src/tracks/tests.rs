@@ -131,13 +131,17 @@ fn rate() {
     println!("10,080 points: p50 {:.1} ms, worst {:.1} ms; {} live", times_ms[10], times_ms[19], t.live().len());
 }
 
+fn wild_point() -> impl Strategy<Value = (f64, f64, f64, f32)> {
+    (-3.0f64..3.0, -3.0f64..3.0, -12.0f64..12.0, 0.0f32..1.0)
+}
+
 proptest! {
-    /// Whatever is thrown at it: ids are unique and rise, stamps rise, numbers are finite, trajectories are accounted for, and a
-    /// second run gives the same.
+    /// Whatever is thrown at it: ids are unique and rise, stamps rise, numbers are finite, trajectories are accounted
+    /// for, and a second run gives the same.
     #[test]
     fn trajectories_are_well_formed_and_repeatable(
         steps in proptest::collection::vec(
-            (0i64..400, 0u8..20, proptest::collection::vec((-3.0f64..3.0, -3.0f64..3.0, -12.0f64..12.0, 0.0f32..1.0), 0..60)), 1..15),
+            (0i64..400, 0u8..20, proptest::collection::vec(wild_point(), 0..60)), 1..15),
     ) {
         let all = || {
             let mut t = Tracker::new(&TracksConfig { max_active: 30, ..Default::default() });
@@ -166,7 +170,8 @@ proptest! {
         for t in &tracks {
             prop_assert!(t.points.len() >= 3 && t.points.windows(2).all(|p| p[0].stamp_ns < p[1].stamp_ns));
             for p in t.points.windows(2) {
-                let predicted = p[0].position_map + p[0].velocity_map_mps * seconds_between(p[0].stamp_ns, p[1].stamp_ns);
+                let dt_sec = seconds_between(p[0].stamp_ns, p[1].stamp_ns);
+                let predicted = p[0].position_map + p[0].velocity_map_mps * dt_sec;
                 prop_assert!(predicted.distance(p[1].position_map) <= 0.5 + 1e-9);
             }
         }

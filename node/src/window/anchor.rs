@@ -4,8 +4,8 @@ use glam::DQuat;
 
 use crate::rigid::Rigid;
 
-/// From x forward, y left, z up to the optical axes x right, y down, z forward, at the same place. Its inverse has the matrix
-/// rows (0 0 1), (-1 0 0), (0 -1 0); as a quaternion all four components are a half, so it is exact.
+/// From x forward, y left, z up to the optical axes x right, y down, z forward, at the same place. Its inverse has the
+/// matrix rows (0 0 1), (-1 0 0), (0 -1 0); as a quaternion all four components are a half, so it is exact.
 pub fn camera_from_flu() -> Rigid {
     Rigid::new(DQuat::from_xyzw(0.5, -0.5, 0.5, 0.5), glam::DVec3::ZERO)
 }

@@ -9,8 +9,8 @@ use super::{PosedSet, Window, camera_from_flu};
 use crate::config::WindowConfig;
 use crate::sync::clock::{seconds_between, signed_ns, unsigned_ns};
 
-/// A set may come this part of `hop_sec` early and still make a step: stamps jitter, and a hop equal to the camera's period
-/// must not lose every second set.
+/// A set may come this part of `hop_sec` early and still make a step: stamps jitter, and a hop equal to the camera's
+/// period must not lose every second set.
 const HOP_TOLERANCE: f64 = 0.05;
 
 /// What became of the sets.

@@ -1,8 +1,8 @@
 //! The sliding window the network sees.
 //!
-//! A window ends at the newest synchronized set, at time t, and takes for k = 1 .. T-1 the set nearest to t - k strides.
-//! When sets come faster than the stride, windows of neighbouring phases interleave: each set is still seen once as the
-//! newest, and again one stride, two strides, ... later.
+//! A window ends at the newest synchronized set, at time t, and takes for k = 1 .. T-1 the set nearest to t - k
+//! strides. When sets come faster than the stride, windows of neighbouring phases interleave: each set is still seen
+//! once as the newest, and again one stride, two strides, ... later.
 
 mod anchor;
 mod builder;
@@ -54,7 +54,8 @@ pub struct Window<T> {
 }
 
 impl<T> Window<T> {
-    /// A camera's pose in the anchor frame. Small numbers: the two map positions are subtracted before anything is rounded.
+    /// A camera's pose in the anchor frame. Small numbers: the two map positions are subtracted before anything is
+    /// rounded.
     ///
     /// # Panics
     /// When the timestep or the camera does not exist.
