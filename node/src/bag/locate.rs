@@ -118,11 +118,9 @@ fn one_storage(folder: &Path, files: Vec<PathBuf>, why: &str) -> Result<Vec<Path
     };
     match files.iter().find(|f| kind(f) != kind(first)) {
         None => Ok(files),
-        Some(second) => Err(BagError::MixedStorage {
-            path: folder.to_owned(),
-            first: file_name(first),
-            second: file_name(second),
-        }),
+        Some(second) => {
+            Err(BagError::MixedStorage { path: folder.to_owned(), first: file_name(first), second: file_name(second) })
+        }
     }
 }
 

@@ -34,7 +34,8 @@ pub(crate) struct SqliteIndex {
 impl SqliteIndex {
     /// Reads the topics and counts the messages.
     pub fn open(path: &Path, problems: &Problems) -> Result<Self, BagError> {
-        let (database, copy) = merged_copy(path, problems)?.map_or((path.to_owned(), None), |(db, dir)| (db, Some(dir)));
+        let (database, copy) =
+            merged_copy(path, problems)?.map_or((path.to_owned(), None), |(db, dir)| (db, Some(dir)));
         let db = connect(&database, path)?;
         let message_columns = columns(&db, "messages").map_err(BagError::sqlite(path))?;
         let topic_columns = columns(&db, "topics").map_err(BagError::sqlite(path))?;
@@ -74,14 +75,8 @@ impl SqliteIndex {
                 Err(e) => problems.add(format!("{}: a row of table `topics` cannot be read: {e}", file_name(path))),
             }
         }
-        let mut index = Self {
-            path: path.to_owned(),
-            database,
-            _copy: copy,
-            topics: Vec::new(),
-            topic_of_id,
-            span_ns: None,
-        };
+        let mut index =
+            Self { path: path.to_owned(), database, _copy: copy, topics: Vec::new(), topic_of_id, span_ns: None };
         for m in index.message_list(&db, problems)? {
             topics.count(m.topic, 1);
             let (a, b) = index.span_ns.unwrap_or((m.log_time_ns, m.log_time_ns));
@@ -229,7 +224,8 @@ fn merged_copy(path: &Path, problems: &Problems) -> Result<Option<(PathBuf, Temp
     match merge() {
         Ok(merged) => Ok(Some(merged)),
         Err(e) => {
-            problems.add(format!("{name}: its write-ahead log ({wal_bytes} bytes) cannot be merged and is left out: {e}"));
+            problems
+                .add(format!("{name}: its write-ahead log ({wal_bytes} bytes) cannot be merged and is left out: {e}"));
             Ok(None)
         }
     }

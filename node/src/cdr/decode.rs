@@ -169,8 +169,11 @@ pub fn pose(type_name: &str, data: &[u8]) -> Result<PoseStamped, CdrError> {
         "geometry_msgs/msg/PoseStamped" => pose_stamped(data),
         "geometry_msgs/msg/PoseWithCovarianceStamped" => pose_with_covariance_stamped(data),
         "nav_msgs/msg/Odometry" => odometry(data),
-        "geometry_msgs/msg/TransformStamped" => transform_stamped(data)
-            .map(|t| PoseStamped { header: t.header, child_frame_id: t.child_frame_id, pose: t.transform }),
+        "geometry_msgs/msg/TransformStamped" => transform_stamped(data).map(|t| PoseStamped {
+            header: t.header,
+            child_frame_id: t.child_frame_id,
+            pose: t.transform,
+        }),
         _ => Err(CdrError::NotAPose {
             type_name: type_name.to_owned(),
             accepted: "geometry_msgs/msg/{PoseStamped, PoseWithCovarianceStamped, TransformStamped}, nav_msgs/msg/Odometry",
@@ -237,10 +240,9 @@ mod tests {
     fn every_message_in_both_byte_orders() {
         for big in [false, true] {
             let w = || Writer::new(big);
-            let img = image(
-                &w().header("cam").u32(2).u32(3).string("mono8").u8(1).u32(3).blob(&[1, 2, 3, 4, 5, 6]).bytes,
-            )
-            .unwrap();
+            let img =
+                image(&w().header("cam").u32(2).u32(3).string("mono8").u8(1).u32(3).blob(&[1, 2, 3, 4, 5, 6]).bytes)
+                    .unwrap();
             assert_eq!((img.height, img.width, img.step, img.is_bigendian), (2, 3, 3, true));
             assert_eq!((img.encoding.as_str(), img.data.as_slice()), ("mono8", &[1, 2, 3, 4, 5, 6][..]));
             assert_eq!((img.header.stamp_ns, img.header.frame_id.as_str()), (STAMP_NS, "cam"));

@@ -61,7 +61,9 @@ impl McapIndex {
                 None
             }
             Tail::Cut => {
-                problems.add(format!("{name}: the file has no end (cut off, or still being recorded); what is there is read"));
+                problems.add(format!(
+                    "{name}: the file has no end (cut off, or still being recorded); what is there is read"
+                ));
                 None
             }
         };
@@ -283,7 +285,9 @@ impl<'a> Walk<'a> {
         for (channel, count) in &counts {
             match self.index.topic_of_channel.get(channel) {
                 Some(topic) => self.topics.count(*topic, *count),
-                None => self.problem(format!("{count} messages on channel {channel}, which nothing describes: skipped")),
+                None => {
+                    self.problem(format!("{count} messages on channel {channel}, which nothing describes: skipped"))
+                }
             }
         }
         if !counts.is_empty() {

@@ -143,7 +143,9 @@ impl McapStream {
             places.push(Place { log_time_ns: head.log_time_ns, chunk_offset: offset, start, len, topic });
         });
         if undescribed > 0 {
-            self.problem(&format!("chunk at byte {offset}: {undescribed} messages on channels nothing describes: skipped"));
+            self.problem(&format!(
+                "chunk at byte {offset}: {undescribed} messages on channels nothing describes: skipped"
+            ));
         }
         if places.is_empty() {
             return Ok(());
