@@ -21,8 +21,11 @@ fn rigids() -> impl Strategy<Value = Rigid> {
 }
 
 fn poses() -> impl Strategy<Value = PoseStamped> {
-    (headers(), "[a-z]{0,9}", rigids())
-        .prop_map(|(header, child_frame_id, pose)| PoseStamped { header, child_frame_id, pose })
+    (headers(), "[a-z]{0,9}", rigids()).prop_map(|(header, child_frame_id, pose)| PoseStamped {
+        header,
+        child_frame_id,
+        pose,
+    })
 }
 
 fn numbers() -> impl Strategy<Value = f64> {

@@ -186,4 +186,26 @@ mod tests {
         assert_eq!(info["relative_file_paths"][0].as_str(), Some("drive_0.mcap"));
         assert_eq!(info["topics_with_message_count"][1]["message_count"].as_u64(), Some(0));
     }
+
+    #[test]
+    fn our_own_reader_finds_the_same_messages_in_file_and_folder() {
+        let dir = tempfile::tempdir().unwrap();
+        let message = encode_float64(4.5).unwrap();
+        for mut bag in [
+            BagWriter::create(&dir.path().join("a.mcap")).unwrap(),
+            BagWriter::create_folder(&dir.path().join("b")).unwrap(),
+        ] {
+            let a = bag.topic("/a", MessageType::Float64, Qos::Reliable).unwrap();
+            (0..1000).for_each(|i| bag.write(a, 5 + i, &message).unwrap());
+            bag.finish().unwrap();
+        }
+        for name in ["a.mcap", "b"] {
+            let bag = crate::bag::Bag::open(&dir.path().join(name)).unwrap();
+            assert_eq!(bag.problems(), [""; 0]);
+            let a = bag.topic("/a").unwrap();
+            let read: Vec<_> = bag.messages(&[a]).unwrap().collect::<Result<_, _>>().unwrap();
+            assert_eq!(read.len(), 1000);
+            assert!(read.iter().enumerate().all(|(i, m)| m.log_time_ns == 5 + i as i64 && m.data == message));
+        }
+    }
 }

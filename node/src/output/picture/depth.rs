@@ -1,7 +1,7 @@
 //! Depth in colour: near is red, far is blue, on a logarithmic scale, with a bar that says which is which.
 
 use super::draw::{text_height, text_width};
-use super::{OutputError, Picture, Rgb, turbo};
+use super::{OutputError, Picture, Rgb, STRIP, STRIP_TEXT, turbo};
 
 /// Colour of pixels without depth (the sky).
 const NO_DEPTH: Rgb = [26, 28, 36];
@@ -73,7 +73,7 @@ pub fn with_depth_bar(picture: &Picture, scale: DepthScale) -> Picture {
     let (width, text_scale) = (picture.width(), if picture.width() >= 480 { 2 } else { 1 });
     let bar = 6 * text_scale;
     let strip = bar + text_height(text_scale) + 3 * text_scale;
-    let mut out = Picture::filled(width, picture.height() + strip, [255; 3]);
+    let mut out = Picture::filled(width, picture.height() + strip, STRIP);
     out.blit(picture, 0, 0);
     let top = picture.height();
     let ratio = (scale.far_m / scale.near_m).ln();
@@ -88,9 +88,9 @@ pub fn with_depth_bar(picture: &Picture, scale: DepthScale) -> Picture {
         let half = text_width(&label, text_scale) / 2;
         let left = col.saturating_sub(half).min(width.saturating_sub(2 * half + 1));
         // Labels that would run into the one before are left out; their tick stays.
-        out.fill_rect(col.min(width.saturating_sub(1)), top + bar, text_scale, text_scale, [60; 3]);
+        out.fill_rect(col.min(width.saturating_sub(1)), top + bar, text_scale, text_scale, STRIP_TEXT);
         if left >= free_from {
-            out.text(&label, left, top + bar + 2 * text_scale, text_scale, [60; 3]);
+            out.text(&label, left, top + bar + 2 * text_scale, text_scale, STRIP_TEXT);
             free_from = left + 2 * half + 6 * text_scale;
         }
     }
@@ -133,7 +133,7 @@ mod tests {
         assert_eq!((out.width(), out.height()), (200, 10 + 6 + 7 + 3));
         assert_eq!(out.get(100, 5), picture.get(100, 5));
         assert_eq!(out.get(0, 12), Some(scale.color(1.0 * (0.0025f32 * 100f32.ln()).exp())));
-        let dark = (18..26).any(|row| (0..200).any(|col| out.get(col, row) == Some([60; 3])));
+        let dark = (18..26).any(|row| (0..200).any(|col| out.get(col, row) == Some(STRIP_TEXT)));
         assert!(dark, "no label drawn");
     }
 }

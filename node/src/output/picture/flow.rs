@@ -1,12 +1,13 @@
-//! Scene flow in colour: direction in the ground plane as hue, speed as saturation, still things white-grey.
+//! Scene flow in colour: direction in the ground plane as hue, speed as saturation and brightness, still things
+//! dark grey.
 
 use super::draw::{text_height, text_width};
-use super::{OutputError, Picture, Rgb, hsv};
+use super::{OutputError, Picture, Rgb, STRIP, STRIP_TEXT, hsv};
 
 /// Colour of pixels without a surface (the sky).
 const NO_FLOW: Rgb = [26, 28, 36];
 /// Brightness of what stands still.
-const STILL_VALUE: f32 = 0.93;
+const STILL_VALUE: f32 = 0.32;
 
 /// Colour of a velocity (m/s; x and y span the ground plane). `full_mps` is the speed of full saturation.
 pub fn flow_color(velocity_mps: [f32; 3], full_mps: f32) -> Rgb {
@@ -17,7 +18,7 @@ pub fn flow_color(velocity_mps: [f32; 3], full_mps: f32) -> Rgb {
     }
     // The square root lifts slow motion, which is what one looks for, out of the grey.
     let strength = if full_mps > 0.0 { (speed / full_mps).min(1.0).sqrt() } else { 0.0 };
-    hsv(vy.atan2(vx) / std::f32::consts::TAU, strength, STILL_VALUE)
+    hsv(vy.atan2(vx) / std::f32::consts::TAU, strength, STILL_VALUE + (1.0 - STILL_VALUE) * strength)
 }
 
 /// Flow in colour, row-major, m/s in axes whose x and y span the ground plane; `valid` false is drawn dark.
@@ -39,12 +40,12 @@ pub fn flow_picture(
     }))
 }
 
-/// The legend: a wheel seen from above, x to the right and y up, `full_mps` at its rim; white outside.
+/// The legend: a wheel seen from above, x to the right and y up, `full_mps` at its rim; the colour of a legend strip outside.
 pub fn flow_wheel(diameter: usize, full_mps: f32) -> Picture {
     let radius = 0.5 * diameter as f32;
     Picture::from_fn(diameter, diameter, |col, row| {
         let (x, y) = ((col as f32 + 0.5 - radius) / radius, (radius - row as f32 - 0.5) / radius);
-        if x.hypot(y) <= 1.0 { flow_color([x * full_mps, y * full_mps, 0.0], full_mps) } else { [255; 3] }
+        if x.hypot(y) <= 1.0 { flow_color([x * full_mps, y * full_mps, 0.0], full_mps) } else { STRIP }
     })
 }
 
@@ -52,13 +53,13 @@ pub fn flow_wheel(diameter: usize, full_mps: f32) -> Picture {
 pub fn with_flow_wheel(picture: &Picture, full_mps: f32) -> Picture {
     let text_scale = if picture.width() >= 480 { 2 } else { 1 };
     let wheel = flow_wheel(16 * text_scale, full_mps);
-    let mut out = Picture::filled(picture.width(), picture.height() + wheel.height(), [255; 3]);
+    let mut out = Picture::filled(picture.width(), picture.height() + wheel.height(), STRIP);
     out.blit(picture, 0, 0);
     out.blit(&wheel, 0, picture.height());
     let label = if full_mps >= 1.0 { format!("{full_mps:.0} m/s") } else { format!("{full_mps:.2} m/s") };
     let row = picture.height() + (wheel.height() - text_height(text_scale)) / 2;
     if wheel.width() + 4 * text_scale + text_width(&label, text_scale) <= out.width() {
-        out.text(&label, wheel.width() + 4 * text_scale, row, text_scale, [60; 3]);
+        out.text(&label, wheel.width() + 4 * text_scale, row, text_scale, STRIP_TEXT);
     }
     out
 }
@@ -82,7 +83,7 @@ mod tests {
     #[test]
     fn the_wheel_agrees_with_the_picture() {
         let wheel = flow_wheel(101, 8.0);
-        assert_eq!(wheel.get(0, 0), Some([255; 3]));
+        assert_eq!(wheel.get(0, 0), Some(STRIP));
         let right = wheel.get(100, 50).unwrap();
         assert!(right[0] > right[1]);
         let p = flow_picture(2, 1, &[[0.0, 8.0, 0.0], [8.0, 0.0, 0.0]], Some(&[true, false]), 8.0).unwrap();

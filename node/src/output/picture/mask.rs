@@ -14,7 +14,7 @@ pub fn palette(id: u16) -> Rgb {
         _ => {
             let k = f32::from(id - 1);
             // Every other round is paler, since hues alone run out.
-            hsv(0.02 + k * HUE_STEP, if (id / 8) % 2 == 0 { 0.85 } else { 0.5 }, 0.98)
+            hsv(0.02 + k * HUE_STEP, if (id / 8).is_multiple_of(2) { 0.85 } else { 0.5 }, 0.98)
         }
     }
 }

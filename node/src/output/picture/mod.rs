@@ -27,6 +27,11 @@ use super::atomic::write_bytes;
 /// An 8-bit sRGB colour.
 pub type Rgb = [u8; 3];
 
+/// Background of legend strips: dark, so that they sit quietly on light and dark pages alike.
+const STRIP: Rgb = [26, 28, 36];
+/// Text and ticks on legend strips.
+const STRIP_TEXT: Rgb = [214, 221, 232];
+
 /// An 8-bit RGB picture, rows from the top.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Picture {

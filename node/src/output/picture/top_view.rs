@@ -8,6 +8,8 @@ const BACKGROUND: Rgb = [16, 18, 24];
 const TRIM: f64 = 0.005;
 /// Free border, as a part of the extent.
 const MARGIN: f64 = 0.04;
+/// Largest side of a point's square, pixels: points are points, however near the view.
+const MAX_POINT_PX: f64 = 9.0;
 /// Least extent shown, metres.
 const MIN_EXTENT_M: f64 = 2.0;
 
@@ -67,18 +69,28 @@ impl TopView {
     }
 }
 
-/// The points from above; `colors[i]` belongs to `points[i]`, points outside the view are left out.
-pub fn top_view_picture(view: &TopView, points: &[[f64; 3]], colors: &[Rgb]) -> Picture {
+/// The points from above; `colors[i]` belongs to `points[i]`, points outside the view are left out. Each point covers a
+/// square of `point_m` metres (the map's voxel size), at least one pixel, so that the map looks closed.
+pub fn top_view_picture(view: &TopView, points: &[[f64; 3]], colors: &[Rgb], point_m: f64) -> Picture {
     let mut picture = Picture::filled(view.width, view.height, BACKGROUND);
     let mut highest = vec![f64::NEG_INFINITY; view.width * view.height];
+    let side = (point_m / view.m_per_px).round();
+    let side = if side > 1.0 { side.min(MAX_POINT_PX) } else { 1.0 };
     for (p, &color) in points.iter().zip(colors) {
         let (x, y) = view.project(*p);
-        if x >= 0.0 && y >= 0.0 && x < view.width as f64 && y < view.height as f64 {
-            let (col, row) = (x as usize, y as usize);
-            let z = &mut highest[row * view.width + col];
-            if p[2] > *z {
-                *z = p[2];
-                picture.set(col, row, color);
+        // The first pixel of a square around the point; for one pixel, the one the point is in.
+        let (x, y) = ((x - 0.5 * (side - 1.0)).floor(), (y - 0.5 * (side - 1.0)).floor());
+        let (right, bottom) = ((x + side).min(view.width as f64), (y + side).min(view.height as f64));
+        if right > 0.0 && bottom > 0.0 && x < right && y < bottom && p[2].is_finite() {
+            // `as` takes what lies left of or above the picture to its edge.
+            for row in y as usize..bottom as usize {
+                for col in x as usize..right as usize {
+                    let z = &mut highest[row * view.width + col];
+                    if p[2] > *z {
+                        *z = p[2];
+                        picture.set(col, row, color);
+                    }
+                }
             }
         }
     }
@@ -95,7 +107,7 @@ mod tests {
         let colors = [[10; 3], [20; 3], [30; 3], [40; 3]];
         let view = TopView::fit(&points, &[[5e6, 35.0, 0.0]], 400, 400);
         assert!(view.width <= 400 && view.height <= 400 && view.height < view.width);
-        let picture = top_view_picture(&view, &points, &colors);
+        let picture = top_view_picture(&view, &points, &colors, 0.0);
         for (p, expected) in [(0, [10; 3]), (1, [20; 3]), (2, [30; 3])] {
             let (x, y) = view.project(points[p]);
             assert_eq!(picture.get(x as usize, y as usize), Some(expected));
@@ -108,13 +120,28 @@ mod tests {
     }
 
     #[test]
+    fn points_cover_their_voxel_and_are_cut_at_the_edge() {
+        let view = TopView { left_m: 0.0, top_m: 10.0, m_per_px: 1.0, width: 10, height: 10 };
+        let painted = |p: [f64; 3], point_m: f64| {
+            let picture = top_view_picture(&view, &[p], &[[200; 3]], point_m);
+            picture.as_bytes().chunks(3).filter(|p| *p == [200; 3]).count()
+        };
+        assert_eq!(painted([5.5, 5.5, 0.0], 3.0), 9);
+        assert_eq!(painted([5.5, 5.5, 0.0], 0.1), 1);
+        assert_eq!(painted([0.5, 9.5, 0.0], 3.0), 4);
+        assert_eq!(painted([9.5, 0.5, 0.0], 3.0), 4);
+        assert_eq!(painted([-5.0, 5.0, 0.0], 3.0), 0);
+        assert_eq!(painted([50.0, 5.0, 0.0], 3.0), 0);
+    }
+
+    #[test]
     fn no_points_and_bad_points_still_give_a_picture() {
         let empty = TopView::fit(&[], &[], 100, 50);
         assert!(empty.m_per_px > 0.0 && empty.width > 0 && empty.height > 0);
         let points = [[f64::NAN, 0.0, 0.0], [1.0, 1.0, 0.0], [f64::INFINITY, 0.0, 0.0]];
         let view = TopView::fit(&points, &[], 100, 50);
         assert!(view.m_per_px.is_finite());
-        let picture = top_view_picture(&view, &points, &[[200; 3]; 3]);
+        let picture = top_view_picture(&view, &points, &[[200; 3]; 3], f64::NAN);
         assert_eq!(picture.as_bytes().chunks(3).filter(|p| *p == [200; 3]).count(), 1);
     }
 }

@@ -13,11 +13,11 @@ pub(super) fn page(report: &Report) -> Result<String, OutputError> {
     let mut body = header(report);
     body.push_str(&banner(&report.weights));
     body.push_str(&highlights(report));
+    body.push_str(&section("errors", "Error figures", &report.errors.as_ref().map(errors).unwrap_or_default()));
     body.push_str(&section("steps", "Step by step", &steps(report)?));
     if let Some(view) = &report.top_view {
         body.push_str(&section("map", "Map and trajectories", &top_view_figure(view)?));
     }
-    body.push_str(&section("errors", "Error figures", &report.errors.as_ref().map(errors).unwrap_or_default()));
     let charts = if report.timings.is_empty() { String::new() } else { timings(report) };
     body.push_str(&section("timing", "Run time", &charts));
     body.push_str(&section("run", "The run", &run_tables(report)));
@@ -43,9 +43,9 @@ fn section(id: &str, title: &str, content: &str) -> String {
 
 fn header(report: &Report) -> String {
     let present = [
+        ("errors", "Errors", report.errors.as_ref().is_some_and(|e| !e.rows.is_empty())),
         ("steps", "Steps", !report.steps.is_empty()),
         ("map", "Map", report.top_view.is_some()),
-        ("errors", "Errors", report.errors.as_ref().is_some_and(|e| !e.rows.is_empty())),
         ("timing", "Run time", !report.timings.is_empty()),
         ("files", "Files", !report.files.is_empty()),
         ("config", "Configuration", !report.config_yaml.is_empty()),
@@ -120,10 +120,10 @@ fn camera_row(camera: &ReportCamera) -> Result<String, OutputError> {
     let mut figures = String::new();
     for panel in &camera.panels {
         let (title, p) = (escape(&panel.title), &panel.picture);
-        // `tabindex` lets a click (or the tab key) enlarge the picture without a script.
+        // The hidden box inside the label lets a click (or tab and space) enlarge the picture without a script.
         figures.push_str(&format!(
-            "<figure class=\"panel\" tabindex=\"0\"><img src=\"{}\" width=\"{}\" height=\"{}\" alt=\"{title}, {}\">\
-             <figcaption><b>{title}</b> {}</figcaption></figure>\n",
+            "<figure class=\"panel\"><label><input type=\"checkbox\" aria-label=\"enlarge {title}\"><img src=\"{}\" \
+             width=\"{}\" height=\"{}\" alt=\"{title}, {}\"></label><figcaption><b>{title}</b> {}</figcaption></figure>\n",
             p.data_uri()?,
             p.width(),
             p.height(),
