@@ -5,7 +5,7 @@ use storm_render::View;
 use storm_render::raster::{Convention, CpuRasterizer, Picture, RasterSettings, Splats};
 
 use super::{Affine, Scene, SkyModel};
-use crate::config::GsplatConvention;
+use crate::config::{GsplatConvention, ModelConfig};
 use crate::error::ModelError;
 use crate::rays::{RayCamera, pixel_offset};
 
@@ -41,15 +41,29 @@ pub struct RenderedView {
 const COLOR_CHANNELS: usize = 3;
 const FLOW_CHANNELS: usize = 3;
 
-impl Scene {
-    /// How the network this scene comes from wants to be rasterised.
+impl ModelConfig {
+    /// How scenes of this network want to be rasterised.
     pub fn raster_settings(&self) -> RasterSettings {
-        let convention = match self.config.gsplat {
+        let convention = match self.gsplat {
             GsplatConvention::Pinned => Convention::Pinned,
             GsplatConvention::Latest => Convention::Latest,
         };
-        let (near, far) = (self.config.near as f32, self.config.far as f32);
-        RasterSettings { convention, near, far, ..RasterSettings::default() }
+        RasterSettings { convention, near: self.near as f32, far: self.far as f32, ..RasterSettings::default() }
+    }
+}
+
+impl RenderedView {
+    /// The colours as 8-bit RGB, row-major, clamped.
+    pub fn rgb8(&self) -> Vec<u8> {
+        // `as u8` saturates.
+        self.color.iter().flatten().map(|c| ((0.5 * c + 0.5) * 255.0).round() as u8).collect()
+    }
+}
+
+impl Scene {
+    /// How the network this scene comes from wants to be rasterised.
+    pub fn raster_settings(&self) -> RasterSettings {
+        self.config.raster_settings()
     }
 
     /// Renders the scene at `time_sec` (seconds since the window's first timestep) into every target.

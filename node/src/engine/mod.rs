@@ -104,14 +104,7 @@ impl Engine {
                 (Storm::untrained(&config, seed, &device(&section.device)?)?, UNTRAINED.to_string())
             }
         };
-        let config = model.config();
-        let settings = RasterSettings {
-            convention: config.raster_convention(),
-            near: config.near,
-            far: config.far,
-            ..RasterSettings::default()
-        };
-        let raster = CpuRasterizer::new(settings)?;
+        let raster = CpuRasterizer::new(model.config().raster_settings())?;
         Ok(Self { model, raster, timespan_sec, weights })
     }
 

@@ -6,8 +6,9 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use serde::Serialize;
-use storm_model::metrics;
-use storm_model::scene::{RenderedView, Want};
+use storm_model::metrics::flow::{FlowEvaluation, FlowFrame};
+use storm_model::metrics::image::{Held, Image, ImageScores};
+use storm_model::scene::Want;
 use storm_render::Intrinsics;
 use storm_render::raster::{CpuRasterizer, RasterSettings};
 
@@ -21,26 +22,6 @@ use crate::window::PosedSet;
 
 /// Sets and ground truth are kept this long beyond the oldest window that still waits to be scored, seconds.
 const KEEP_SEC: f64 = 2.0;
-
-/// A running mean of what could be computed.
-#[derive(Debug, Clone, Copy, Default)]
-struct Mean {
-    sum: f64,
-    n: u64,
-}
-
-impl Mean {
-    fn add(&mut self, x: Option<f64>) {
-        if let Some(x) = x.filter(|x| x.is_finite()) {
-            self.sum += x;
-            self.n += 1;
-        }
-    }
-
-    fn get(&self) -> Option<f64> {
-        (self.n > 0).then(|| self.sum / self.n as f64)
-    }
-}
 
 /// Figures of one method; `None` where nothing could be compared. Definitions: `storm_model::metrics`.
 #[derive(Debug, Clone, Default, Serialize, PartialEq)]
@@ -112,61 +93,25 @@ impl Scores {
     }
 }
 
-#[derive(Default)]
-struct Totals {
-    psnr: Mean,
-    psnr_dynamic: Mean,
-    ssim: Mean,
-    ssim_dynamic: Mean,
-    depth: Mean,
-    depth_dynamic: Mean,
-    epe3d: Mean,
-    acc5: Mean,
-    acc10: Mean,
-    theta: Mean,
-}
-
-impl Totals {
-    fn figures(&self) -> Figures {
-        Figures {
-            psnr: self.psnr.get(),
-            psnr_dynamic: self.psnr_dynamic.get(),
-            ssim: self.ssim.get(),
-            ssim_dynamic: self.ssim_dynamic.get(),
-            depth_rmse: self.depth.get(),
-            depth_rmse_dynamic: self.depth_dynamic.get(),
-            epe3d: self.epe3d.get(),
-            acc5: self.acc5.get(),
-            acc10: self.acc10.get(),
-            theta: self.theta.get(),
-        }
-    }
-
-    fn image(&mut self, pred01: &[f32], true01: &[f32], size: (usize, usize), truth: &TruthAt) {
-        let (w, h) = size;
-        let solid = truth.sky.as_ref().map(|sky| sky.iter().map(|&s| s == 0).collect::<Vec<bool>>());
-        self.psnr.add(metrics::image::psnr(pred01, true01, 3, solid.as_deref()));
-        self.ssim.add(metrics::image::ssim(pred01, true01, w, h, 3, solid.as_deref()));
-        if let Some(moving) = truth.moving_mask() {
-            self.psnr_dynamic.add(metrics::image::psnr(pred01, true01, 3, Some(&moving)));
-            self.ssim_dynamic.add(metrics::image::ssim(pred01, true01, w, h, 3, Some(&moving)));
-        }
-    }
-
-    fn depth(&mut self, view: &RenderedView, truth: &TruthAt) {
-        let Some(depth) = &truth.depth else { return };
-        let known: Vec<bool> = depth.iter().map(|&d| d > 0.0).collect();
-        self.depth.add(metrics::image::depth_rmse(&view.depth, depth, Some(&known)));
-        if let Some(moving) = truth.moving_mask() {
-            let both: Vec<bool> = known.iter().zip(&moving).map(|(a, b)| *a && *b).collect();
-            self.depth_dynamic.add(metrics::image::depth_rmse(&view.depth, depth, Some(&both)));
+impl Figures {
+    /// Means over images, without sky where the sky is known.
+    fn of_images(scores: &[ImageScores]) -> Self {
+        let m = ImageScores::mean(scores);
+        Self {
+            psnr: m.psnr_occupied.or(m.psnr),
+            psnr_dynamic: m.psnr_dynamic,
+            ssim: m.ssim_occupied.or(m.ssim),
+            ssim_dynamic: m.ssim_dynamic,
+            depth_rmse: m.depth_rmse,
+            depth_rmse_dynamic: m.depth_rmse_dynamic,
+            ..Self::default()
         }
     }
 }
 
 /// Ground truth of one picture, at the picture's size.
-#[derive(Default)]
 struct TruthAt {
+    size: (usize, usize),
     depth: Option<Vec<f32>>,
     flow: Option<Vec<[f32; 3]>>,
     moving: Option<Vec<u16>>,
@@ -174,8 +119,19 @@ struct TruthAt {
 }
 
 impl TruthAt {
-    fn moving_mask(&self) -> Option<Vec<bool>> {
-        self.moving.as_ref().map(|m| m.iter().map(|&x| x != 0).collect())
+    /// Scores of a picture against what the camera saw; `depth` is the prediction, where the method has one.
+    fn compare(&self, pred01: &[f32], true01: &[f32], depth: Option<&[f32]>) -> Result<ImageScores> {
+        let image = |values| Image { values, width: self.size.0, height: self.size.1, channels: 3 };
+        let flags = |mask: &Option<Vec<u16>>| mask.as_ref().map(|m| m.iter().map(|&x| x != 0).collect::<Vec<bool>>());
+        let (sky, dynamic) = (flags(&self.sky), flags(&self.moving));
+        let held = Held {
+            pred: image(pred01),
+            truth: image(true01),
+            depth: depth.zip(self.depth.as_deref()),
+            sky: sky.as_deref(),
+            dynamic: dynamic.as_deref(),
+        };
+        Ok(held.scores()?)
     }
 }
 
@@ -187,9 +143,9 @@ pub struct Scorer {
     sets: VecDeque<Arc<PosedSet<Frame>>>,
     truth: BTreeMap<(i64, usize, TruthKind), TruthImage>,
     waiting: Option<Arc<Step>>,
-    images: u64,
-    ours: Totals,
-    nearest: Totals,
+    ours: Vec<ImageScores>,
+    flow: FlowEvaluation,
+    nearest: Vec<ImageScores>,
 }
 
 impl Scorer {
@@ -202,9 +158,9 @@ impl Scorer {
             sets: VecDeque::new(),
             truth: BTreeMap::new(),
             waiting: None,
-            images: 0,
-            ours: Totals::default(),
-            nearest: Totals::default(),
+            ours: Vec::new(),
+            flow: FlowEvaluation::default(),
+            nearest: Vec::new(),
         })
     }
 
@@ -232,12 +188,19 @@ impl Scorer {
         if let Some(last) = self.waiting.take() {
             self.score(&last)?;
         }
-        let any = self.images > 0 || self.ours.epe3d.n > 0;
-        Ok(any.then(|| Scores {
-            images: self.images,
-            storm: self.ours.figures(),
-            nearest_context: self.nearest.figures(),
-        }))
+        let flow = self.flow.means();
+        if self.ours.is_empty() && flow.timesteps == 0 {
+            return Ok(None);
+        }
+        let storm = Figures {
+            epe3d: flow.epe3d,
+            acc5: flow.acc5,
+            acc10: flow.acc10,
+            theta: flow.theta,
+            ..Figures::of_images(&self.ours)
+        };
+        let nearest_context = Figures::of_images(&self.nearest);
+        Ok(Some(Scores { images: self.ours.len() as u64, storm, nearest_context }))
     }
 
     fn forget(&mut self, oldest_ns: i64) {
@@ -262,8 +225,7 @@ impl Scorer {
         for set in spread(&inside, self.frames_per_step, step.index) {
             self.score_set(step, set)?;
         }
-        self.score_flow(step);
-        Ok(())
+        self.score_flow(step)
     }
 
     fn score_set(&mut self, step: &Step, set: &PosedSet<Frame>) -> Result<()> {
@@ -277,40 +239,35 @@ impl Scorer {
             let size = (view.width, view.height);
             let true01 = unit(&set.frames[camera].item.rgb.data);
             let truth = self.truth_at(camera, stamp_ns, size);
-            self.ours.image(&unit(&view.rgb8()), &true01, size, &truth);
-            self.ours.depth(view, &truth);
+            self.ours.push(truth.compare(&unit(&view.rgb8()), &true01, Some(&view.depth))?);
             if let Some(nearest) = nearest_context(step, camera, stamp_ns) {
-                self.nearest.image(&unit(nearest), &true01, size, &truth);
+                self.nearest.push(truth.compare(&unit(nearest), &true01, None)?);
             }
-            self.images += 1;
         }
         Ok(())
     }
 
-    /// Rendered flow of the newest context frames against the truth, all cameras pooled, where depth is known.
-    fn score_flow(&mut self, step: &Step) {
-        let Some(newest) = step.window.steps.last() else { return };
-        let rotation = step.window.map_from_anchor.rotation.as_quat();
-        let (mut pred, mut label) = (Vec::new(), Vec::new());
+    /// Rendered flow of the newest context frames against the truth, all cameras pooled, by the paper's rules.
+    fn score_flow(&mut self, step: &Step) -> Result<()> {
+        let Some(newest) = step.window.steps.last() else { return Ok(()) };
+        let map_from_anchor = step.window.map_from_anchor.rotation.as_quat();
+        let (mut pred, mut truth, mut depth) = (Vec::new(), Vec::new(), Vec::new());
         for (camera, view) in step.views.iter().enumerate() {
-            let truth = self.truth_at(camera, newest.frames[camera].stamp_ns, (view.width, view.height));
-            let (Some(flow), Some(true_flow), Some(depth)) = (&view.flow, &truth.flow, &truth.depth) else { continue };
-            for p in (0..depth.len()).filter(|&p| depth[p] > 0.0) {
-                pred.push((rotation * glam::Vec3::from(flow[p])).to_array());
-                label.push(true_flow[p]);
-            }
+            let at = self.truth_at(camera, newest.frames[camera].stamp_ns, (view.width, view.height));
+            let (Some(flow), Some(true_flow), Some(true_depth)) = (&view.flow, at.flow, at.depth) else { continue };
+            pred.extend(flow.iter().map(|&f| (map_from_anchor * glam::Vec3::from(f)).to_array()));
+            truth.extend(true_flow);
+            depth.extend(true_depth);
         }
-        if let Some(f) = metrics::flow::scene_flow(&pred, &label) {
-            self.ours.epe3d.add(Some(f.epe3d));
-            self.ours.acc5.add(Some(f.acc5));
-            self.ours.acc10.add(Some(f.acc10));
-            self.ours.theta.add(f.theta);
+        if !truth.is_empty() {
+            self.flow.add(&[FlowFrame { pred: &pred, truth: &truth, depth: &depth, ground: None }])?;
         }
+        Ok(())
     }
 
     /// Ground truth at `size`, sampled at pixel centres.
     fn truth_at(&self, camera: usize, stamp_ns: i64, size: (usize, usize)) -> TruthAt {
-        let mut at = TruthAt::default();
+        let mut at = TruthAt { size, depth: None, flow: None, moving: None, sky: None };
         for kind in [TruthKind::Depth, TruthKind::Flow, TruthKind::Moving, TruthKind::Sky] {
             let Some(image) = self.truth.get(&(stamp_ns, camera, kind)) else { continue };
             match (&*image.data, kind) {
@@ -363,15 +320,5 @@ mod tests {
         assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (2, 1)), Some(vec![5, 7]));
         assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (4, 2)), Some(vec![0, 1, 2, 3, 4, 5, 6, 7]));
         assert_eq!(sample(&[0, 1], &image, (4, 2)), None);
-    }
-
-    #[test]
-    fn means_ignore_what_could_not_be_computed() {
-        let mut m = Mean::default();
-        assert_eq!(m.get(), None);
-        for x in [Some(1.0), None, Some(f64::NAN), Some(3.0)] {
-            m.add(x);
-        }
-        assert_eq!(m.get(), Some(2.0));
     }
 }
