@@ -105,6 +105,26 @@ impl ModelConfig {
         (self.image_height / self.patch_size, self.image_width / self.patch_size)
     }
 
+    /// Tokens in front of the image tokens: sky, one affine token per camera, motion.
+    pub fn auxiliary_tokens(&self) -> usize {
+        let affine = if self.use_affine_token { self.num_cams } else { 0 };
+        usize::from(self.use_sky_token) + affine + self.num_motion_tokens
+    }
+
+    /// The size in one line, for people.
+    pub fn describe(&self) -> String {
+        format!(
+            "patch {}, width {}, depth {}, {} heads, {} motion tokens, made for {}x{}",
+            self.patch_size,
+            self.embed_dim,
+            self.depth,
+            self.num_heads,
+            self.num_motion_tokens,
+            self.image_width,
+            self.image_height
+        )
+    }
+
     /// Channels of a velocity: 3, or 6 with one for each direction of time.
     pub fn velocity_channels(&self) -> usize {
         match self.velocity {

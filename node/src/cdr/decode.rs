@@ -6,7 +6,7 @@
 use glam::{DQuat, DVec3};
 
 use super::read::{CdrError, CdrReader};
-use crate::msg::{CameraInfo, CompressedImage, Header, Image, PoseStamped, TransformStamped};
+use crate::msg::{CameraInfo, PointCloud2, PointField, CompressedImage, Header, Image, PoseStamped, TransformStamped};
 use crate::rigid::Rigid;
 
 /// Nanoseconds in a second.
@@ -69,6 +69,38 @@ pub fn image(data: &[u8]) -> Result<Image, CdrError> {
 pub fn compressed_image(data: &[u8]) -> Result<CompressedImage, CdrError> {
     let r = &mut CdrReader::new("sensor_msgs/msg/CompressedImage", data)?;
     Ok(CompressedImage { header: read_header(r)?, format: r.string("format")?, data: r.bytes("data")?.to_vec() })
+}
+
+/// `sensor_msgs/msg/PointCloud2`.
+///
+/// # Errors
+/// Not plain CDR, or a field reaches past the end.
+pub fn point_cloud2(data: &[u8]) -> Result<PointCloud2, CdrError> {
+    // A field is at least its name's length word, two integers and a byte.
+    const FIELD_MIN_BYTES: usize = 13;
+    let r = &mut CdrReader::new("sensor_msgs/msg/PointCloud2", data)?;
+    let (header, height, width) = (read_header(r)?, r.u32("height")?, r.u32("width")?);
+    let count = r.sequence_len("fields", FIELD_MIN_BYTES)?;
+    let mut fields = Vec::with_capacity(count);
+    for _ in 0..count {
+        fields.push(PointField {
+            name: r.string("fields.name")?,
+            offset: r.u32("fields.offset")?,
+            datatype: r.u8("fields.datatype")?,
+            count: r.u32("fields.count")?,
+        });
+    }
+    r.u8("is_bigendian")?;
+    Ok(PointCloud2 {
+        header,
+        height,
+        width,
+        fields,
+        point_step: r.u32("point_step")?,
+        row_step: r.u32("row_step")?,
+        data: r.bytes("data")?.to_vec(),
+        is_dense: r.u8("is_dense")? != 0,
+    })
 }
 
 /// `sensor_msgs/msg/CameraInfo`.

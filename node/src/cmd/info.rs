@@ -27,7 +27,10 @@ pub fn run(args: &Args) -> Result<Outcome> {
         None => Config::default(),
     };
     let bag = Bag::open(&args.bag).with_context(|| format!("cannot read bag {}", args.bag.display()))?;
-    let seconds = (bag.end_ns() as f64 - bag.start_ns() as f64) * 1e-9;
+    let seconds = match (bag.start_ns(), bag.end_ns()) {
+        (Some(start), Some(end)) => (end as f64 - start as f64) * 1e-9,
+        _ => 0.0,
+    };
     println!("{}: {} messages over {seconds:.2} s", args.bag.display(), bag.message_count());
     for t in bag.topics() {
         println!("  {:>7}  {}  {} ({})", t.count, t.name, t.type_name, t.serialization);

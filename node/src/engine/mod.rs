@@ -90,6 +90,7 @@ fn device(name: &str) -> Result<Device> {
 pub struct Engine {
     model: Storm,
     raster: CpuRasterizer,
+    device: Device,
     timespan_sec: f64,
     weights: String,
 }
@@ -97,15 +98,16 @@ pub struct Engine {
 impl Engine {
     /// Ready for windows of `cameras` cameras. `timespan_sec` is what the network's clock is divided by.
     pub fn new(source: ModelSource, section: &ModelConfigSection, cameras: usize, timespan_sec: f64) -> Result<Self> {
+        let device = device(&section.device)?;
         let (model, weights) = match source {
             ModelSource::Loaded { model, name } => (*model, name),
             ModelSource::Untrained { mut config, seed } => {
                 config.num_cams = config.num_cams.max(cameras);
-                (Storm::untrained(&config, seed, &device(&section.device)?)?, UNTRAINED.to_string())
+                (Storm::untrained(&config, seed, &device)?, UNTRAINED.to_string())
             }
         };
         let raster = CpuRasterizer::new(model.config().raster_settings())?;
-        Ok(Self { model, raster, timespan_sec, weights })
+        Ok(Self { model, raster, device, timespan_sec, weights })
     }
 
     /// The network's configuration.
@@ -138,7 +140,7 @@ impl Engine {
                 (0..cameras.len().min(pictures[t].len())).map(view).collect()
             })
             .collect();
-        let batch = ClipBatch::from_views(&views, PixelLayout::Hwc, self.timespan_sec, self.model.device())?;
+        let batch = ClipBatch::from_views(&views, PixelLayout::Hwc, self.timespan_sec, &self.device)?;
         Ok(self.model.forward(&batch)?.scene(0)?)
     }
 

@@ -31,6 +31,19 @@ pub enum DropReason {
 }
 
 impl DropReason {
+    /// Every reason, in order.
+    pub const ALL: [Self; 9] = [
+        Self::Late,
+        Self::Duplicate,
+        Self::Incomplete,
+        Self::NoPose,
+        Self::PoseGap,
+        Self::NoCalibration,
+        Self::ClockJump,
+        Self::Decode,
+        Self::Overflow,
+    ];
+
     /// The name used in logs and `metrics.json`.
     pub fn as_str(self) -> &'static str {
         match self {
