@@ -26,6 +26,7 @@ enum Schema {
 /// A database with messages `from..to`, written in descending time order, on `/a` and (odd ones) `/b`.
 fn database(path: &Path, schema: Schema, from: i64, to: i64, pack: bool) {
     let db = Connection::open(path).unwrap();
+    db.execute_batch("PRAGMA synchronous = OFF; BEGIN").unwrap();
     let extra = match schema {
         Schema::Oldest => "",
         Schema::Old => ", serialization_format TEXT NOT NULL",
@@ -53,6 +54,7 @@ fn database(path: &Path, schema: Schema, from: i64, to: i64, pack: bool) {
         let topic = if i % 2 == 0 { 4 } else { 9 };
         db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", (topic, i * 10, data)).unwrap();
     }
+    db.execute_batch("COMMIT").unwrap();
 }
 
 fn read(path: &Path) -> (Bag, Vec<RawMessage>) {
@@ -245,6 +247,7 @@ fn cut_databases_never_panic() {
     let whole = std::fs::read(&path).unwrap();
     let mut best = 0;
     for cut in (1..whole.len()).step_by(1511) {
+        let path = dir.path().join(format!("{cut}.db3"));
         std::fs::write(&path, &whole[..cut]).unwrap();
         if let Ok(bag) = Bag::open(&path) {
             let all: Vec<usize> = (0..bag.topics().len()).collect();
@@ -269,6 +272,7 @@ proptest! {
             let i = (at * bytes.len() as f64) as usize;
             bytes[i] = value;
         }
+        let path = dir.path().join("damaged.db3");
         std::fs::write(&path, &bytes).unwrap();
         if let Ok(bag) = Bag::open(&path) {
             let readable: Vec<usize> = (0..bag.topics().len()).filter(|i| bag.topics()[*i].is_readable()).collect();
