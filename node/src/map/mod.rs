@@ -11,7 +11,7 @@ mod select;
 
 use std::collections::HashMap;
 
-use glam::{DVec3, Quat, Vec3};
+use glam::{DMat3, DVec3, Quat, Vec3};
 use serde::Serialize;
 use storm_render::Gaussians;
 
@@ -126,7 +126,7 @@ impl VoxelMap {
         let origin = *self.origin.get_or_insert(map_from_anchor.translation);
         let placed = Placed {
             origin_from_anchor: map_from_anchor.translation - origin,
-            map_from_anchor: *map_from_anchor,
+            turn: map_from_anchor.matrix3(),
             rotation: map_from_anchor.rotation.as_quat(),
             voxel_m: self.voxel_m,
         };
@@ -207,7 +207,8 @@ impl VoxelMap {
 /// One window's place in the map.
 struct Placed {
     origin_from_anchor: DVec3,
-    map_from_anchor: Rigid,
+    /// The same rotation twice: for positions in f64, for shapes in f32.
+    turn: DMat3,
     rotation: Quat,
     voxel_m: f64,
 }
@@ -231,7 +232,7 @@ impl Placed {
         if !(plausible && scale.is_finite() && color.is_finite() && q.is_finite()) {
             return None;
         }
-        let position = self.origin_from_anchor + self.map_from_anchor.rotation * mean.as_dvec3();
+        let position = self.origin_from_anchor + self.turn * mean.as_dvec3();
         let index = (position / self.voxel_m).floor();
         if index.abs().max_element() <= MAX_INDEX {
             let offset = (position - (index + 0.5) * self.voxel_m).as_vec3();
