@@ -61,6 +61,18 @@ impl Linear {
             _ => f(&self.pack()?),
         }
     }
+
+    fn with_parts<R>(&self, f: impl FnOnce(&PackedWeight, Option<&[f32]>) -> Result<R>) -> Result<R> {
+        with_optional(self.bias.as_ref(), |bias| self.with_packed(|packed| f(packed, bias)))
+    }
+
+    /// Whether weight and bias fit each other and an input of these dimensions.
+    fn takes(&self, dims: &[usize]) -> bool {
+        match (self.weight.dims(), dims.last()) {
+            (&[n, k], Some(&last)) => k == last && self.bias.as_ref().is_none_or(|b| b.dims() == [n]),
+            _ => false,
+        }
+    }
 }
 
 /// What follows a linear layer.
@@ -107,15 +119,45 @@ pub fn linear(x: &Tensor, layer: &Linear, act: Activation, residual: Option<&Ten
     }
     let same_shape = residual.is_none_or(|r| r.dims() == dims);
     let inputs = [Some(x), Some(&layer.weight), layer.bias.as_ref(), residual];
-    if !same_shape || x.elem_count() == 0 || !covered(inputs.into_iter().flatten()) {
+    if !same_shape || x.elem_count() == 0 || n == 0 || !covered(inputs.into_iter().flatten()) {
         return plain::linear(x, layer, act, residual);
     }
     let mut out = vec![0f32; dims.iter().product()];
     with_values(x, |x| {
-        with_optional(layer.bias.as_ref(), |bias| {
-            with_optional(residual, |residual| {
-                layer.with_packed(|packed| {
-                    gemm::linear(x, packed, Epilogue { bias, act, residual }, &mut out);
+        with_optional(residual, |residual| {
+            layer.with_parts(|packed, bias| {
+                gemm::linear(x, packed, Epilogue { bias, act, residual }, &mut out);
+                Ok(())
+            })
+        })
+    })?;
+    Tensor::from_vec(out, dims, x.device())
+}
+
+/// `linear(linear(x, first, act), second) + residual`. The kernel goes through both layers a block of rows at a time, so the
+/// wide tensor between them is never in memory.
+pub fn mlp(x: &Tensor, first: &Linear, act: Activation, second: &Linear, residual: Option<&Tensor>) -> Result<Tensor> {
+    let mut dims = x.dims().to_vec();
+    let n = second.weight.dim(0)?;
+    if let Some(last) = dims.last_mut() {
+        *last = n;
+    }
+    let inputs =
+        [Some(x), Some(&first.weight), first.bias.as_ref(), Some(&second.weight), second.bias.as_ref(), residual];
+    let fits = first.takes(x.dims())
+        && second.takes(first.weight.dims().get(..1).unwrap_or_default())
+        && residual.is_none_or(|r| r.dims() == dims);
+    if !fits || x.elem_count() == 0 || second.weight.elem_count() == 0 || !covered(inputs.into_iter().flatten()) {
+        return linear(&linear(x, first, act, None)?, second, Activation::None, residual);
+    }
+    let mut out = vec![0f32; dims.iter().product()];
+    with_values(x, |x| {
+        with_optional(residual, |residual| {
+            first.with_parts(|w1, bias| {
+                let one = Epilogue { bias, act, residual: None };
+                second.with_parts(|w2, bias| {
+                    let two = Epilogue { bias, act: Activation::None, residual };
+                    gemm::mlp(x, (w1, one), (w2, two), &mut out);
                     Ok(())
                 })
             })
@@ -242,6 +284,16 @@ mod tests {
         }
 
         #[test]
+        fn mlp_is_two_layers(m in 1usize..60, k in 1usize..40, h in 1usize..90, n in 1usize..40, add: bool, seed in 0u64..1000) {
+            let x = noise(seed, &[2, m, k], 1.0);
+            let (one, two) = (layer(seed + 1, h, k, true), layer(seed + 3, n, h, add));
+            let residual = add.then(|| noise(seed + 5, &[2, m, n], 1.0));
+            let got = mlp(&x, &one, Activation::Gelu, &two, residual.as_ref()).unwrap();
+            let between = plain::linear(&x, &one, Activation::Gelu, None).unwrap();
+            same(&got, &plain::linear(&between, &two, Activation::None, residual.as_ref()).unwrap());
+        }
+
+        #[test]
         fn rows_are_the_plain_ones(m in 1usize..50, n in 1usize..200, seed in 0u64..1000, learned: bool) {
             let x = noise(seed, &[2, m, n], 3.0);
             let (w, b) = (noise(seed + 1, &[n], 1.0), noise(seed + 2, &[n], 1.0));
@@ -308,6 +360,9 @@ mod tests {
         let wrong_bias = Linear::new(noise(1, &[8, 6], 1.0), Some(noise(1, &[7], 1.0)));
         assert!(linear(&x, &wrong_bias, Activation::None, None).is_err());
         assert!(linear(&x, &layer(2, 8, 6, false), Activation::None, Some(&noise(3, &[5, 7], 1.0))).is_err());
+        assert!(mlp(&x, &layer(2, 8, 6, true), Activation::None, &layer(3, 4, 9, true), None).is_err());
+        assert!(mlp(&x, &layer(2, 8, 7, true), Activation::None, &layer(3, 4, 8, true), None).is_err());
+        assert!(mlp(&x, &layer(2, 8, 6, true), Activation::None, &layer(3, 4, 8, true), Some(&x)).is_err());
         assert!(attention(&noise(1, &[1, 5, 6], 1.0), 4).is_err());
         assert!(attention(&noise(1, &[1, 5, 6], 1.0), 0).is_err());
         assert!(layer_norm(&x, Some(&noise(1, &[5], 1.0)), None, 1e-6).is_err());
