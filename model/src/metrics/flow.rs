@@ -140,7 +140,7 @@ pub struct FlowMeans {
     pub outliers: Option<f64>,
     /// Radians. A timestep without a moving point counts as 0, as in the paper's program.
     pub theta: Option<f64>,
-    /// Root mean squared error of the components, m/s, ground included, mean over samples.
+    /// Root mean squared error of the components, m/s, over the points of known depth, ground included; mean over timesteps.
     pub rmse: Option<f64>,
     /// Timesteps counted.
     pub timesteps: usize,
@@ -150,15 +150,12 @@ impl FlowEvaluation {
     /// Adds the timesteps of one sample, if anything in it moves faster than 1 m/s. Figures are over the points of known
     /// depth that are not ground, per timestep.
     pub fn add(&mut self, frames: &[FlowFrame<'_>]) -> Result<(), MetricError> {
-        let mut fastest = 0f64;
-        for frame in frames {
-            for (i, &t) in frame.truth.iter().enumerate() {
-                fastest = fastest.max(norm(widen("true flow", i, t)?));
-            }
-        }
+        // Unknown points (not finite) say nothing about speed; those that are scored are checked below.
+        let speeds = frames.iter().flat_map(|f| f.truth).map(|t| norm(t.map(f64::from)));
+        let fastest = speeds.filter(|s| s.is_finite()).fold(0.0, f64::max);
         if fastest > SAMPLE_MIN_SPEED_MPS {
-            let mut squares = Mean::default();
             for frame in frames {
+                let mut squares = Mean::default();
                 check_len("true depth", frame.depth.len(), frame.truth.len())?;
                 check_mask(frame.ground, frame.truth.len())?;
                 let known: Vec<bool> = frame.depth.iter().map(|&d| d > 0.0).collect();
@@ -166,6 +163,7 @@ impl FlowEvaluation {
                     let (p, t) = pair?;
                     difference(p, t).iter().for_each(|d| squares.add(Some(d * d)));
                 }
+                self.rmse.add(squares.value().map(f64::sqrt));
                 let counted: Vec<bool> =
                     known.iter().enumerate().map(|(i, &k)| k && frame.ground.is_none_or(|g| !g[i])).collect();
                 if let Some(scores) = flow_scores(frame.pred, frame.truth, Some(&counted))? {
@@ -176,7 +174,6 @@ impl FlowEvaluation {
                     self.theta.add(Some(scores.theta.unwrap_or(0.0)));
                 }
             }
-            self.rmse.add(squares.value().map(f64::sqrt));
         }
         Ok(())
     }
