@@ -211,7 +211,7 @@ fn top_view(run: &Run) -> TopViewSection {
         })
         .collect();
     let caption = format!("{} map Gaussians from above, x to the right, y up; the vehicle's way; trajectories of moving points", run.map.len());
-    TopViewSection { view, picture: top_view_picture(&view, &points, &colors), tracks, trajectory, caption }
+    TopViewSection { view, picture: top_view_picture(&view, &points, &colors, run.config.map.voxel_m), tracks, trajectory, caption }
 }
 
 fn files(report: &Path) -> Vec<ReportFile> {
