@@ -2,7 +2,7 @@
 //! every channel is one multiply-add per row, so that more channels cost little.
 
 use super::settings::{ALPHA_FLOOR, ALPHA_MIN, TRANSMITTANCE_STOP};
-use super::simd::{dispatch, exp2_neg, fma};
+use super::simd::{dispatch, exp2_neg_lanes, fma};
 use super::sort::{key_depth, key_slot};
 use super::tiles::{Chunk, Record, TILE_H, TILE_W};
 
@@ -10,12 +10,12 @@ use super::tiles::{Chunk, Record, TILE_H, TILE_W};
 const WIDTH: usize = 8;
 /// Row pitch of the tile's buffers: a sweep may begin at the last pixel and run into the padding.
 const PITCH: usize = TILE_W + WIDTH;
-/// Numbers in one channel's buffer.
-const PLANE: usize = TILE_H * PITCH;
 /// Channels every picture has: `sum(w)` and `sum(w z)`.
 const BASE_PLANES: usize = 2;
 /// Splats fetched together, so that their cache misses overlap.
 const BATCH: usize = 32;
+/// Sign bit of an f32.
+const SIGN: u32 = 1 << 31;
 
 /// A tile and the splats it shows.
 pub(crate) struct TileInput<'a> {
@@ -47,8 +47,7 @@ pub(crate) struct RowOut<'a> {
 #[derive(Clone, Copy)]
 struct Cut {
     record: Record,
-    depth: f32,
-    id: u32,
+    key: u64,
     /// Box inside the tile.
     x0: usize,
     x1: usize,
@@ -56,17 +55,21 @@ struct Cut {
     y1: usize,
 }
 
+/// A row of one plane.
+type Row = [f32; PITCH];
+
 /// Buffers of one tile, reused.
 pub(crate) struct Scratch {
     /// Transmittance; negated once the pixel is finished, 0 outside the picture.
-    transmittance: Box<[f32; PLANE]>,
-    /// `sum(w)`, `sum(w z)`, then the features, one plane each.
-    planes: Vec<f32>,
+    transmittance: [Row; TILE_H],
+    /// Per tile row: `sum(w)`, `sum(w z)`, then the features.
+    sums: Vec<Row>,
     /// Per row, a bit for each unfinished pixel.
     live: [u32; TILE_H],
-    weights: [[f32; WIDTH]; TILE_H],
+    records: Vec<Record>,
     batch: Vec<Cut>,
-    batch_features: Vec<f32>,
+    /// What each splat of the batch adds to the planes: 1, its depth, its features.
+    values: Vec<f32>,
     /// For sorting.
     pub(crate) spare_keys: Vec<u64>,
 }
@@ -76,42 +79,39 @@ const _: () = assert!(TILE_W == u32::BITS as usize, "a row of a tile is one u32 
 impl Scratch {
     pub(crate) fn new() -> Self {
         Self {
-            transmittance: Box::new([0.0; PLANE]),
-            planes: Vec::new(),
+            transmittance: [[0.0; PITCH]; TILE_H],
+            sums: Vec::new(),
             live: [0; TILE_H],
-            weights: [[0.0; WIDTH]; TILE_H],
+            records: Vec::with_capacity(BATCH),
             batch: Vec::with_capacity(BATCH),
-            batch_features: Vec::new(),
+            values: Vec::new(),
             spare_keys: Vec::new(),
         }
     }
 
-    fn reset(&mut self, width: usize, height: usize, feature_count: usize) {
-        self.planes.clear();
-        self.planes.resize(PLANE * (BASE_PLANES + feature_count), 0.0);
-        self.batch_features.resize(BATCH * feature_count, 0.0);
+    fn reset(&mut self, width: usize, height: usize, planes: usize) {
+        self.sums.clear();
+        self.sums.resize(TILE_H * planes, [0.0; PITCH]);
+        self.values.resize(BATCH * planes, 0.0);
         for y in 0..TILE_H {
             let row_width = if y < height { width.min(TILE_W) } else { 0 };
             self.live[y] = low_bits(row_width);
-            let row = &mut self.transmittance[y * PITCH..(y + 1) * PITCH];
-            row[..row_width].fill(1.0);
-            row[row_width..].fill(0.0);
+            self.transmittance[y][..row_width].fill(1.0);
+            self.transmittance[y][row_width..].fill(0.0);
         }
     }
 
     /// Writes the tile into its rows of the picture.
     pub(crate) fn write(&self, rows: &mut [RowOut], feature_count: usize) {
-        let (base, features) = self.planes.split_at(BASE_PLANES * PLANE);
-        for (y, row) in rows.iter_mut().enumerate() {
-            let pixels = row.alpha.len();
-            let weight = &base[y * PITCH..][..pixels];
-            let weighted_depth = &base[PLANE + y * PITCH..][..pixels];
-            for x in 0..pixels {
-                row.alpha[x] = weight[x].min(1.0);
-                row.depth[x] = weighted_depth[x] / weight[x].max(ALPHA_FLOOR);
+        let planes = BASE_PLANES + feature_count;
+        for (row, sums) in rows.iter_mut().zip(self.sums.chunks_exact(planes)) {
+            let [weight, weighted_depth, features @ ..] = sums else { continue };
+            let pixels = row.alpha.iter_mut().zip(row.depth.iter_mut());
+            for ((alpha, depth), (w, wz)) in pixels.zip(weight.iter().zip(weighted_depth)) {
+                *alpha = w.min(1.0);
+                *depth = wz / w.max(ALPHA_FLOOR);
             }
-            for channel in 0..feature_count {
-                let source = &features[channel * PLANE + y * PITCH..][..pixels];
+            for (channel, source) in features.iter().enumerate() {
                 for (pixel, &value) in row.features.chunks_exact_mut(feature_count).zip(source) {
                     // Weights add up to 1 give or take rounding, which features near f32::MAX do not forgive.
                     pixel[channel] = value.clamp(f32::MIN, f32::MAX);
@@ -134,13 +134,15 @@ dispatch!(
 
 #[inline(always)]
 fn blend_tile_kernel<const FMA: bool>(input: &TileInput, scratch: &mut Scratch) {
-    scratch.reset(input.width, input.height, input.feature_count);
+    let planes = BASE_PLANES + input.feature_count;
+    scratch.reset(input.width, input.height, planes);
     for keys in input.keys.chunks(BATCH) {
         fetch(input, keys, scratch);
-        for j in 0..scratch.batch.len() {
-            let cut = scratch.batch[j];
-            if is_live(&scratch.live, &cut) {
-                blend_splat::<FMA>(input, &cut, j, scratch);
+        let splats = scratch.batch.iter().zip(scratch.values.chunks_exact(planes));
+        for (cut, values) in splats {
+            if is_live(&scratch.live, cut) {
+                let (transmittance, sums) = (&mut scratch.transmittance, &mut scratch.sums);
+                blend_splat::<FMA>(input, cut, values, transmittance, sums, &mut scratch.live);
             }
         }
         if scratch.live.iter().fold(0, |a, b| a | b) == 0 {
@@ -156,20 +158,22 @@ fn is_live(live: &[u32; TILE_H], cut: &Cut) -> bool {
     live[cut.y0..cut.y1].iter().fold(0, |a, b| a | b) & columns != 0
 }
 
-/// Copies the records, and then the features, of those splats of a batch that may still add something.
+/// Copies the records, and then the features, of those splats of a batch that may still add something. Each loop
+/// has independent loads and no branch that waits for them, so that the cache misses overlap.
 #[inline(always)]
 fn fetch(input: &TileInput, keys: &[u64], scratch: &mut Scratch) {
-    scratch.batch.clear();
     let slot_mask = (1usize << input.chunk_bits) - 1;
-    for &key in keys {
+    let view_of = |slot: usize| &input.chunks[slot >> input.chunk_bits].views[input.view];
+    scratch.records.clear();
+    scratch.records.extend(keys.iter().map(|&key| {
         let slot = key_slot(key);
-        let view = &input.chunks[slot >> input.chunk_bits].views[input.view];
-        let at = slot & slot_mask;
-        let record = view.records[at];
+        view_of(slot).records[slot & slot_mask]
+    }));
+    scratch.batch.clear();
+    for (&key, &record) in keys.iter().zip(&scratch.records) {
         let cut = Cut {
             record,
-            depth: key_depth(key),
-            id: view.ids[at],
+            key,
             x0: usize::from(record.x0).max(input.x0) - input.x0,
             x1: usize::from(record.x1).min(input.x0 + input.width) - input.x0,
             y0: usize::from(record.y0).max(input.y0) - input.y0,
@@ -180,87 +184,143 @@ fn fetch(input: &TileInput, keys: &[u64], scratch: &mut Scratch) {
         }
     }
     let channels = input.feature_count;
-    if channels > 0 {
-        for (cut, row) in scratch.batch.iter().zip(scratch.batch_features.chunks_exact_mut(channels)) {
-            row.copy_from_slice(&input.features[cut.id as usize * channels..][..channels]);
+    let rows = scratch.values.chunks_exact_mut(BASE_PLANES + channels);
+    for (cut, row) in scratch.batch.iter().zip(rows) {
+        let slot = key_slot(cut.key);
+        let id = view_of(slot).ids[slot & slot_mask] as usize;
+        let [one, depth, features @ ..] = row else { continue };
+        (*one, *depth) = (1.0, key_depth(cut.key));
+        // A loop, not a copy: a call to memcpy costs more than three channels.
+        for (to, &from) in features.iter_mut().zip(&input.features[id * channels..][..channels]) {
+            *to = from;
         }
     }
 }
+
+/// `0` for the lanes below the index, infinity from there on.
+const EDGE: [[f32; WIDTH]; WIDTH + 1] = {
+    let mut table = [[f32::INFINITY; WIDTH]; WIDTH + 1];
+    let mut columns = 0;
+    while columns <= WIDTH {
+        let mut l = 0;
+        while l < columns {
+            table[columns][l] = 0.0;
+            l += 1;
+        }
+        columns += 1;
+    }
+    table
+};
 
 /// Blends one splat, strip by strip of eight columns.
 #[inline(always)]
-fn blend_splat<const FMA: bool>(input: &TileInput, cut: &Cut, in_batch: usize, scratch: &mut Scratch) {
+fn blend_splat<const FMA: bool>(
+    input: &TileInput,
+    cut: &Cut,
+    values: &[f32],
+    transmittance: &mut [Row; TILE_H],
+    sums: &mut [Row],
+    live: &mut [u32; TILE_H],
+) {
     let record = &cut.record;
-    let features = &scratch.batch_features[in_batch * input.feature_count..][..input.feature_count];
-    // The tile's corner seen from the box's corner: small whole numbers, exact in f32.
-    let from_box_x = input.x0 as f32 - f32::from(record.x0);
-    let from_box_y = input.y0 as f32 - f32::from(record.y0);
-    let rows = cut.y1 - cut.y0;
+    // The tile's corner seen from the centre; the whole numbers are exact, so small boxes keep all digits.
+    let left = (input.x0 as f32 - f32::from(record.x0)) + 0.5;
+    let top = (input.y0 as f32 - f32::from(record.y0)) + 0.5;
     for strip in (cut.x0..cut.x1).step_by(WIDTH) {
-        let columns = cut.x1 - strip;
-        let mut dx = [0.0f32; WIDTH];
+        // Outside the box (the rule's tiles may cut the ellipse short) alpha becomes 0.
+        let mut dx = EDGE[(cut.x1 - strip).min(WIDTH)];
+        let first = left + strip as f32 - record.u;
         for l in 0..WIDTH {
-            let offset = from_box_x + (strip + l) as f32 + 0.5 - record.u;
-            // Outside the box (the rule's tiles may cut the ellipse short) alpha becomes 0.
-            dx[l] = if l < columns { offset } else { f32::INFINITY };
+            dx[l] += first + l as f32;
         }
         let mut finished = [0u32; WIDTH];
-        for row in 0..rows {
-            let dy = from_box_y + (cut.y0 + row) as f32 + 0.5 - record.v;
+        let rows = transmittance[cut.y0..cut.y1].iter_mut();
+        let sums = sums[cut.y0 * values.len()..].chunks_exact_mut(values.len());
+        for ((y, row), sums) in (cut.y0..cut.y1).zip(rows).zip(sums) {
+            let dy = top + y as f32 - record.v;
             let shift = record.slope * dy;
             let along = record.along * dy * dy;
-            let at = (cut.y0 + row) * PITCH + strip;
-            let Some(transmittance) = scratch.transmittance[at..].first_chunk_mut::<WIDTH>() else { continue };
-            let weights = &mut scratch.weights[row];
+            let Some(before) = row[strip..].first_chunk_mut::<WIDTH>() else { continue };
+            let mut falloff = [0.0; WIDTH];
             for l in 0..WIDTH {
                 let across = dx[l] - shift;
-                let exponent = fma::<FMA>(record.across * across, across, along);
-                let falloff = record.opacity * exp2_neg::<FMA>(exponent);
-                let alpha = if falloff < input.alpha_cap { falloff } else { input.alpha_cap };
-                let before = transmittance[l];
-                let hit = (alpha >= ALPHA_MIN) & (before > 0.0);
-                let weight = if hit { alpha * before } else { 0.0 };
-                let after = before - weight;
-                let stop = hit & (after <= TRANSMITTANCE_STOP);
-                transmittance[l] = if stop { -before } else { after };
-                weights[l] = if stop { 0.0 } else { weight };
-                finished[l] |= u32::from(stop);
+                falloff[l] = fma::<FMA>(record.across * across, across, along);
+            }
+            exp2_neg_lanes::<FMA>(&mut falloff);
+            let step = shade(&falloff, before, record.opacity, input.alpha_cap);
+            *before = step.after;
+            for l in 0..WIDTH {
+                finished[l] |= step.finished[l];
+            }
+            for (plane, &value) in sums.iter_mut().zip(values) {
+                let Some(sum) = plane[strip..].first_chunk_mut::<WIDTH>() else { continue };
+                for l in 0..WIDTH {
+                    sum[l] = fma::<FMA>(step.weight[l], value, sum[l]);
+                }
             }
         }
-        let planes = &mut scratch.planes;
-        let at = cut.y0 * PITCH + strip;
-        let weights = &scratch.weights[..rows];
-        accumulate::<FMA>(&mut planes[at..], weights, 1.0);
-        accumulate::<FMA>(&mut planes[PLANE + at..], weights, cut.depth);
-        for (channel, &value) in features.iter().enumerate() {
-            accumulate::<FMA>(&mut planes[(BASE_PLANES + channel) * PLANE + at..], weights, value);
-        }
         if finished.iter().fold(0, |a, b| a | b) != 0 {
-            retire(&mut scratch.live, &scratch.transmittance, cut.y0..cut.y1, strip);
+            retire(live, transmittance, cut.y0..cut.y1, strip);
         }
     }
 }
 
-/// `plane += weights * value` over the rows of a strip.
+/// What a splat does to eight pixels.
+struct Step {
+    weight: [f32; WIDTH],
+    after: [f32; WIDTH],
+    /// All ones where the splat finishes the pixel, else 0.
+    finished: [u32; WIDTH],
+}
+
+/// Weights of a splat whose falloff and whose pixels' transmittance are given. One operation per loop, conditions as
+/// bit masks: straight-line code the compiler reliably turns into vectors.
 #[inline(always)]
-fn accumulate<const FMA: bool>(plane: &mut [f32], weights: &[[f32; WIDTH]], value: f32) {
-    for (row, weight) in weights.iter().enumerate() {
-        let Some(target) = plane[row * PITCH..].first_chunk_mut::<WIDTH>() else { continue };
-        for l in 0..WIDTH {
-            target[l] = fma::<FMA>(weight[l], value, target[l]);
-        }
+fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap: f32) -> Step {
+    let (mut alpha, mut hit, mut weight) = ([0.0f32; WIDTH], [0u32; WIDTH], [0.0f32; WIDTH]);
+    let (mut after, mut finished) = ([0.0f32; WIDTH], [0u32; WIDTH]);
+    for l in 0..WIDTH {
+        alpha[l] = opacity * falloff[l];
     }
+    for l in 0..WIDTH {
+        alpha[l] = if alpha[l] < alpha_cap { alpha[l] } else { alpha_cap };
+    }
+    for l in 0..WIDTH {
+        hit[l] = mask(alpha[l] >= ALPHA_MIN) & mask(before[l] > 0.0);
+    }
+    for l in 0..WIDTH {
+        weight[l] = f32::from_bits((alpha[l] * before[l]).to_bits() & hit[l]);
+    }
+    for l in 0..WIDTH {
+        after[l] = before[l] - weight[l];
+    }
+    for l in 0..WIDTH {
+        finished[l] = mask(after[l] <= TRANSMITTANCE_STOP) & hit[l];
+    }
+    for l in 0..WIDTH {
+        weight[l] = f32::from_bits(weight[l].to_bits() & !finished[l]);
+    }
+    for l in 0..WIDTH {
+        // A finished pixel keeps its transmittance, negated.
+        let kept = (before[l].to_bits() ^ SIGN) & finished[l];
+        after[l] = f32::from_bits((after[l].to_bits() & !finished[l]) | kept);
+    }
+    Step { weight, after, finished }
+}
+
+/// All ones or 0.
+#[inline(always)]
+fn mask(condition: bool) -> u32 {
+    0u32.wrapping_sub(u32::from(condition))
 }
 
 /// Clears the live bits of the pixels a strip has finished.
 #[cold]
 #[inline(never)]
-fn retire(live: &mut [u32; TILE_H], transmittance: &[f32; PLANE], rows: std::ops::Range<usize>, strip: usize) {
-    for row in rows {
-        for x in strip..(strip + WIDTH).min(TILE_W) {
-            if transmittance[row * PITCH + x] < 0.0 {
-                live[row] &= !(1 << x);
-            }
+fn retire(live: &mut [u32; TILE_H], transmittance: &[Row; TILE_H], rows: std::ops::Range<usize>, strip: usize) {
+    for (bits, row) in live[rows.clone()].iter_mut().zip(&transmittance[rows]) {
+        for (x, &t) in row.iter().enumerate().skip(strip).take(WIDTH.min(TILE_W - strip)) {
+            *bits &= !(u32::from(t < 0.0) << x);
         }
     }
 }
