@@ -2,9 +2,9 @@
 //! every channel is one multiply-add per row, so that more channels cost little.
 
 use super::settings::{ALPHA_FLOOR, ALPHA_MIN, TRANSMITTANCE_STOP};
-use super::simd::{dispatch, exp2_neg_lanes, fma};
+use super::simd::{dispatch, exp2_neg_lanes, fma, prefetch};
 use super::sort::{key_depth, key_slot};
-use super::tiles::{Chunk, Record, TILE_H, TILE_W};
+use super::tiles::{Chunk, ChunkView, Record, TILE_H, TILE_W};
 
 /// Pixels blended together.
 const WIDTH: usize = 8;
@@ -14,6 +14,8 @@ const PITCH: usize = TILE_W + WIDTH;
 const BASE_PLANES: usize = 2;
 /// Splats fetched together, so that their cache misses overlap.
 const BATCH: usize = 32;
+/// Numbers in a cache line.
+const LINE_FLOATS: usize = 16;
 /// Sign bit of an f32.
 const SIGN: u32 = 1 << 31;
 
@@ -47,7 +49,8 @@ pub(crate) struct RowOut<'a> {
 #[derive(Clone, Copy)]
 struct Cut {
     record: Record,
-    key: u64,
+    depth: f32,
+    id: u32,
     /// Box inside the tile.
     x0: usize,
     x1: usize,
@@ -66,10 +69,9 @@ pub(crate) struct Scratch {
     sums: Vec<Row>,
     /// Per row, a bit for each unfinished pixel.
     live: [u32; TILE_H],
-    records: Vec<Record>,
+    /// Splats to blend now, and those to blend next.
     batch: Vec<Cut>,
-    /// What each splat of the batch adds to the planes: 1, its depth, its features.
-    values: Vec<f32>,
+    fetched: Vec<Cut>,
     /// For sorting.
     pub(crate) spare_keys: Vec<u64>,
 }
@@ -82,9 +84,8 @@ impl Scratch {
             transmittance: [[0.0; PITCH]; TILE_H],
             sums: Vec::new(),
             live: [0; TILE_H],
-            records: Vec::with_capacity(BATCH),
             batch: Vec::with_capacity(BATCH),
-            values: Vec::new(),
+            fetched: Vec::with_capacity(BATCH),
             spare_keys: Vec::new(),
         }
     }
@@ -92,7 +93,6 @@ impl Scratch {
     fn reset(&mut self, width: usize, height: usize, planes: usize) {
         self.sums.clear();
         self.sums.resize(TILE_H * planes, [0.0; PITCH]);
-        self.values.resize(BATCH * planes, 0.0);
         for y in 0..TILE_H {
             let row_width = if y < height { width.min(TILE_W) } else { 0 };
             self.live[y] = low_bits(row_width);
@@ -134,15 +134,22 @@ dispatch!(
 
 #[inline(always)]
 fn blend_tile_kernel<const FMA: bool>(input: &TileInput, scratch: &mut Scratch) {
-    let planes = BASE_PLANES + input.feature_count;
-    scratch.reset(input.width, input.height, planes);
-    for keys in input.keys.chunks(BATCH) {
-        fetch(input, keys, scratch);
-        let splats = scratch.batch.iter().zip(scratch.values.chunks_exact(planes));
-        for (cut, values) in splats {
+    scratch.reset(input.width, input.height, BASE_PLANES + input.feature_count);
+    let batch = |index: usize| {
+        let keys = input.keys.get(index * BATCH..).unwrap_or_default();
+        keys.get(..BATCH).unwrap_or(keys)
+    };
+    // While one batch is blended, the next has its features on the way and the one after that its records.
+    prefetch_records(input, batch(0));
+    prefetch_records(input, batch(1));
+    fetch(input, batch(0), scratch);
+    for index in 0..input.keys.len().div_ceil(BATCH) {
+        std::mem::swap(&mut scratch.batch, &mut scratch.fetched);
+        prefetch_records(input, batch(index + 2));
+        fetch(input, batch(index + 1), scratch);
+        for cut in &scratch.batch {
             if is_live(&scratch.live, cut) {
-                let (transmittance, sums) = (&mut scratch.transmittance, &mut scratch.sums);
-                blend_splat::<FMA>(input, cut, values, transmittance, sums, &mut scratch.live);
+                blend_splat::<FMA>(input, cut, &mut scratch.transmittance, &mut scratch.sums, &mut scratch.live);
             }
         }
         if scratch.live.iter().fold(0, |a, b| a | b) == 0 {
@@ -158,41 +165,45 @@ fn is_live(live: &[u32; TILE_H], cut: &Cut) -> bool {
     live[cut.y0..cut.y1].iter().fold(0, |a, b| a | b) & columns != 0
 }
 
-/// Copies the records, and then the features, of those splats of a batch that may still add something. Each loop
-/// has independent loads and no branch that waits for them, so that the cache misses overlap.
+/// The chunk and the position in it that a key stands for.
+#[inline(always)]
+fn locate<'a>(input: &TileInput<'a>, key: u64) -> (&'a ChunkView, usize) {
+    let slot = key_slot(key);
+    (&input.chunks[slot >> input.chunk_bits].views[input.view], slot & ((1 << input.chunk_bits) - 1))
+}
+
+/// Asks for the records and ids of a batch.
+#[inline(always)]
+fn prefetch_records(input: &TileInput, keys: &[u64]) {
+    for &key in keys {
+        let (view, at) = locate(input, key);
+        prefetch(&view.records, at);
+        prefetch(&view.ids, at);
+    }
+}
+
+/// Reads the records of a batch, keeps the splats that may still add something, and asks for their features.
 #[inline(always)]
 fn fetch(input: &TileInput, keys: &[u64], scratch: &mut Scratch) {
-    let slot_mask = (1usize << input.chunk_bits) - 1;
-    let view_of = |slot: usize| &input.chunks[slot >> input.chunk_bits].views[input.view];
-    scratch.records.clear();
-    scratch.records.extend(keys.iter().map(|&key| {
-        let slot = key_slot(key);
-        view_of(slot).records[slot & slot_mask]
-    }));
-    scratch.batch.clear();
-    for (&key, &record) in keys.iter().zip(&scratch.records) {
+    scratch.fetched.clear();
+    for &key in keys {
+        let (view, at) = locate(input, key);
+        let record = view.records[at];
         let cut = Cut {
             record,
-            key,
+            depth: key_depth(key),
+            id: view.ids[at],
             x0: usize::from(record.x0).max(input.x0) - input.x0,
             x1: usize::from(record.x1).min(input.x0 + input.width) - input.x0,
             y0: usize::from(record.y0).max(input.y0) - input.y0,
             y1: usize::from(record.y1).min(input.y0 + input.height) - input.y0,
         };
         if is_live(&scratch.live, &cut) {
-            scratch.batch.push(cut);
-        }
-    }
-    let channels = input.feature_count;
-    let rows = scratch.values.chunks_exact_mut(BASE_PLANES + channels);
-    for (cut, row) in scratch.batch.iter().zip(rows) {
-        let slot = key_slot(cut.key);
-        let id = view_of(slot).ids[slot & slot_mask] as usize;
-        let [one, depth, features @ ..] = row else { continue };
-        (*one, *depth) = (1.0, key_depth(cut.key));
-        // A loop, not a copy: a call to memcpy costs more than three channels.
-        for (to, &from) in features.iter_mut().zip(&input.features[id * channels..][..channels]) {
-            *to = from;
+            let first = cut.id as usize * input.feature_count;
+            for at in (first..first + input.feature_count).step_by(LINE_FLOATS) {
+                prefetch(input.features, at);
+            }
+            scratch.fetched.push(cut);
         }
     }
 }
@@ -217,12 +228,13 @@ const EDGE: [[f32; WIDTH]; WIDTH + 1] = {
 fn blend_splat<const FMA: bool>(
     input: &TileInput,
     cut: &Cut,
-    values: &[f32],
     transmittance: &mut [Row; TILE_H],
     sums: &mut [Row],
     live: &mut [u32; TILE_H],
 ) {
     let record = &cut.record;
+    let features = &input.features[cut.id as usize * input.feature_count..][..input.feature_count];
+    let planes = BASE_PLANES + features.len();
     // The tile's corner seen from the centre; the whole numbers are exact, so small boxes keep all digits.
     let left = (input.x0 as f32 - f32::from(record.x0)) + 0.5;
     let top = (input.y0 as f32 - f32::from(record.y0)) + 0.5;
@@ -235,7 +247,7 @@ fn blend_splat<const FMA: bool>(
         }
         let mut finished = [0u32; WIDTH];
         let rows = transmittance[cut.y0..cut.y1].iter_mut();
-        let sums = sums[cut.y0 * values.len()..].chunks_exact_mut(values.len());
+        let sums = sums[cut.y0 * planes..].chunks_exact_mut(planes);
         for ((y, row), sums) in (cut.y0..cut.y1).zip(rows).zip(sums) {
             let dy = top + y as f32 - record.v;
             let shift = record.slope * dy;
@@ -252,15 +264,25 @@ fn blend_splat<const FMA: bool>(
             for l in 0..WIDTH {
                 finished[l] |= step.finished[l];
             }
-            for (plane, &value) in sums.iter_mut().zip(values) {
-                let Some(sum) = plane[strip..].first_chunk_mut::<WIDTH>() else { continue };
-                for l in 0..WIDTH {
-                    sum[l] = fma::<FMA>(step.weight[l], value, sum[l]);
-                }
+            let [weight_sum, weighted_depth, feature_sums @ ..] = sums else { continue };
+            add::<FMA>(weight_sum, strip, &step.weight, 1.0);
+            add::<FMA>(weighted_depth, strip, &step.weight, cut.depth);
+            for (sum, &feature) in feature_sums.iter_mut().zip(features) {
+                add::<FMA>(sum, strip, &step.weight, feature);
             }
         }
         if finished.iter().fold(0, |a, b| a | b) != 0 {
             retire(live, transmittance, cut.y0..cut.y1, strip);
+        }
+    }
+}
+
+/// `sum += weight * value` at eight pixels of a row.
+#[inline(always)]
+fn add<const FMA: bool>(sum: &mut Row, strip: usize, weight: &[f32; WIDTH], value: f32) {
+    if let Some(sum) = sum[strip..].first_chunk_mut::<WIDTH>() {
+        for l in 0..WIDTH {
+            sum[l] = fma::<FMA>(weight[l], value, sum[l]);
         }
     }
 }
