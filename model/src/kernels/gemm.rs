@@ -125,6 +125,13 @@ pub struct Epilogue<'a> {
 /// as much as a few percent of the products.
 #[derive(Default)]
 struct Scratch {
+    blocks: BlockScratch,
+    /// Rows between the two layers of [`mlp`].
+    hidden: Aligned,
+}
+
+#[derive(Default)]
+struct BlockScratch {
     packed: Aligned,
     partial: Aligned,
 }
@@ -135,12 +142,10 @@ thread_local! {
 
 /// One task: some rows of the output.
 struct Block<'a> {
-    scratch: &'a mut Scratch,
+    scratch: &'a mut BlockScratch,
     x: &'a [f32],
     w: &'a PackedWeight,
-    bias: Option<&'a [f32]>,
-    act: Activation,
-    residual: Option<&'a [f32]>,
+    epilogue: Epilogue<'a>,
     out: &'a mut [f32],
 }
 
@@ -172,6 +177,7 @@ impl Kernel for Block<'_> {
     #[inline(always)]
     fn run<S: Simd, const MR: usize>(self) {
         let (n, k) = (self.w.n, self.w.k);
+        let Epilogue { bias, act, residual } = self.epilogue;
         let nr = 2 * S::W;
         let m = self.out.len() / n;
         let row_panels = m.div_ceil(MR);
@@ -215,9 +221,9 @@ impl Kernel for Block<'_> {
                                 let place = row * n + col..row * n + col + width;
                                 finish::<S>(
                                     &mut sums[r * nr..(r + 1) * nr],
-                                    self.bias.map(|b| &b[col..col + width]),
-                                    self.act,
-                                    self.residual.map(|x| &x[place.clone()]),
+                                    bias.map(|b| &b[col..col + width]),
+                                    act,
+                                    residual.map(|x| &x[place.clone()]),
                                     &mut self.out[place],
                                 );
                             }
@@ -263,6 +269,27 @@ fn finish<S: Simd>(sums: &mut [f32], bias: Option<&[f32]>, act: Activation, resi
     out.copy_from_slice(&sums[..width]);
 }
 
+/// Panics unless the lengths fit `m` rows through the layer.
+fn check(x: &[f32], w: &PackedWeight, epilogue: &Epilogue<'_>, m: usize, out: usize) {
+    let (n, k) = (w.n, w.k);
+    assert_eq!(out, m * n, "output of {m} x {n}");
+    assert_eq!(x.len(), m * k, "input of {m} x {k}");
+    assert!(epilogue.bias.is_none_or(|b| b.len() == n), "bias of {n}");
+    assert!(epilogue.residual.is_none_or(|r| r.len() == m * n), "residual of {m} x {n}");
+}
+
+/// Rows of a task: few enough that every thread gets several, at most a block.
+fn task_rows(isa: Isa, m: usize) -> usize {
+    m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(isa.tile_rows()).min(BLOCK_ROWS)
+}
+
+impl<'a> Epilogue<'a> {
+    /// The same for `count` values of the output from `at` on.
+    fn part(&self, at: usize, count: usize) -> Self {
+        Self { residual: self.residual.map(|r| &r[at..at + count]), ..*self }
+    }
+}
+
 /// `out = act(x w^T + bias) + residual` for row-major `x` `(m, k)` and `out` `(m, n)`.
 ///
 /// Panics when the lengths disagree (callers take them from tensor shapes).
@@ -272,25 +299,45 @@ pub fn linear(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, out: &mut [f3
         return;
     }
     let m = out.len() / n;
-    assert_eq!(out.len(), m * n, "output of {m} x {n}");
-    assert_eq!(x.len(), m * k, "input of {m} x {k}");
-    if let Some(bias) = epilogue.bias {
-        assert_eq!(bias.len(), n, "bias of {n}");
-    }
-    if let Some(residual) = epilogue.residual {
-        assert_eq!(residual.len(), m * n, "residual of {m} x {n}");
-    }
-    let mr = w.isa.tile_rows();
-    let share = m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(mr);
-    let rows = share.min(BLOCK_ROWS);
-    out.par_chunks_mut(rows * n).enumerate().for_each(|(i, out)| {
-        let first = i * rows;
-        let count = out.len() / n;
-        let residual = epilogue.residual.map(|r| &r[first * n..(first + count) * n]);
-        let x = &x[first * k..(first + count) * k];
+    check(x, w, &epilogue, m, out.len());
+    let rows = task_rows(w.isa, m);
+    out.par_chunks_mut(rows * n).zip(x.par_chunks(rows * k)).enumerate().for_each(|(i, (out, x))| {
+        let epilogue = epilogue.part(i * rows * n, out.len());
         // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
         SCRATCH.with_borrow_mut(|scratch| {
-            dispatch(w.isa, Block { scratch, x, w, bias: epilogue.bias, act: epilogue.act, residual, out });
+            dispatch(w.isa, Block { scratch: &mut scratch.blocks, x, w, epilogue, out });
+        });
+    });
+}
+
+/// Two layers, `out = linear(linear(x, first), second)`, block of rows by block of rows: what lies between them, several
+/// times as wide as `x` in a transformer, never leaves the cache. Same bits as two calls of [`linear`].
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes).
+pub fn mlp(
+    x: &[f32],
+    (w1, first): (&PackedWeight, Epilogue<'_>),
+    (w2, second): (&PackedWeight, Epilogue<'_>),
+    out: &mut [f32],
+) {
+    let (n, hidden, k) = (w2.n, w1.n, w1.k);
+    if n == 0 || out.is_empty() {
+        return;
+    }
+    let m = out.len() / n;
+    assert!(w1.isa == w2.isa && w2.k == hidden, "{hidden} outputs into {} inputs", w2.k);
+    check(x, w1, &first, m, m * hidden);
+    assert!(second.residual.is_none_or(|r| r.len() == m * n) && out.len() == m * n, "output of {m} x {n}");
+    assert!(second.bias.is_none_or(|b| b.len() == n), "bias of {n}");
+    let rows = task_rows(w1.isa, m);
+    out.par_chunks_mut(rows * n).zip(x.par_chunks(rows * k)).enumerate().for_each(|(i, (out, x))| {
+        let count = out.len() / n;
+        let first = first.part(i * rows * hidden, count * hidden);
+        let second = second.part(i * rows * n, out.len());
+        SCRATCH.with_borrow_mut(|Scratch { blocks, hidden: between }| {
+            let between = between.at_least(count * hidden);
+            dispatch(w1.isa, Block { scratch: blocks, x, w: w1, epilogue: first, out: between });
+            dispatch(w2.isa, Block { scratch: blocks, x: between, w: w2, epilogue: second, out });
         });
     });
 }
@@ -333,7 +380,7 @@ mod tests {
             (200, 530, 19),
             (13, 48, 1030),
         ];
-        for isa in Isa::available() {
+        for isa in Isa::tested() {
             for (s, &(m, n, k)) in shapes.iter().enumerate() {
                 let scale = 1.0 / (k as f32).sqrt();
                 let x = noise(s as u64, m * k, 1.0);
@@ -351,6 +398,24 @@ mod tests {
                     }
                 }
             }
+        }
+    }
+
+    #[test]
+    fn two_layers_at_once_are_two_calls() {
+        let (m, k, hidden, n) = (130, 40, 300, 50);
+        let (x, residual) = (noise(1, m * k, 1.0), noise(2, m * n, 1.0));
+        let (b1, b2) = (noise(3, hidden, 1.0), noise(4, n, 1.0));
+        for isa in Isa::tested() {
+            let w1 = PackedWeight::new(isa, &noise(5, hidden * k, 0.2), hidden, k);
+            let w2 = PackedWeight::new(isa, &noise(6, n * hidden, 0.1), n, hidden);
+            let first = Epilogue { bias: Some(&b1), act: Activation::Gelu, residual: None };
+            let second = Epilogue { bias: Some(&b2), act: Activation::None, residual: Some(&residual) };
+            let (mut between, mut want, mut got) = (vec![0.0; m * hidden], vec![0.0; m * n], vec![0.0; m * n]);
+            linear(&x, &w1, first, &mut between);
+            linear(&between, &w2, second, &mut want);
+            mlp(&x, (&w1, first), (&w2, second), &mut got);
+            assert_eq!(got, want);
         }
     }
 

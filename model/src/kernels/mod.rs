@@ -54,6 +54,17 @@ impl Isa {
         sets
     }
 
+    /// The sets tests run: those available, and AVX-512's vectors and tiles on AVX2 where only that is (see
+    /// `simd::run_wide`).
+    #[cfg(test)]
+    pub(crate) fn tested() -> Vec<Self> {
+        let mut sets = Self::available();
+        if sets.last() == Some(&Isa::Avx2) {
+            sets.push(Isa::Avx512);
+        }
+        sets
+    }
+
     /// Floats in one vector register.
     pub(crate) fn lanes(self) -> usize {
         match self {

@@ -77,7 +77,7 @@ mod tests {
 
     #[test]
     fn softmax_of_any_width() {
-        for isa in Isa::available() {
+        for isa in Isa::tested() {
             for width in [1, 3, 8, 16, 17, 100] {
                 let x = noise(width as u64, 50 * width, 6.0);
                 let mut out = vec![f32::NAN; x.len()];
