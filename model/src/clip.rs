@@ -9,7 +9,8 @@ use crate::error::ModelError;
 
 /// `b` windows of `t` timesteps and `v` cameras, as tensors.
 ///
-/// The world is the window's anchor frame (x forward, y left, z up, metres; see the crate's README for where it sits).
+/// The world is the window's anchor frame: placed at the reference (front) camera of the first timestep, x forward, y
+/// left, z up, metres.
 #[derive(Debug, Clone)]
 pub struct ClipBatch {
     /// `(b, t, v, 3, h, w)`, colours in -1..1.

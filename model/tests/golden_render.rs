@@ -1,4 +1,5 @@
 //! Moving, splatting, sky and exposure against the authors' program, from our own network's output.
+#![allow(clippy::unwrap_used)]
 
 mod golden;
 
@@ -38,10 +39,7 @@ fn render(scene: &Scene, inputs: &Goldens, settings: RasterSettings, want: Want)
     all
 }
 
-fn flat<'a, T: 'a>(views: &'a [RenderedView], pick: impl Fn(&'a RenderedView) -> &'a [T]) -> Vec<T>
-where
-    T: Copy,
-{
+fn flat<'a, T: Copy + 'a>(views: &'a [RenderedView], pick: impl Fn(&'a RenderedView) -> &'a [T]) -> Vec<T> {
     views.iter().flat_map(|view| pick(view).iter().copied()).collect()
 }
 

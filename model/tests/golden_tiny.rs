@@ -1,4 +1,5 @@
 //! The network against the authors' program, stage by stage, on the tiny weights stored in `tests/fixtures/tiny_storm`.
+#![allow(clippy::unwrap_used)]
 
 mod golden;
 

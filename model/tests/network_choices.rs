@@ -1,4 +1,5 @@
 //! The network under every choice, window shape and bad input, on a small untrained network.
+#![allow(clippy::unwrap_used)]
 
 use candle_core::{Device, Tensor, Var};
 use glam::{Affine3A, Quat, Vec3};

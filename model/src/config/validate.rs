@@ -45,7 +45,7 @@ impl ModelConfig {
         in_range("embed_dim", self.embed_dim, 1, MAX_WIDTH)?;
         in_range("depth", self.depth, 1, 64)?;
         in_range("num_heads", self.num_heads, 1, MAX_WIDTH)?;
-        if self.embed_dim % self.num_heads != 0 {
+        if !self.embed_dim.is_multiple_of(self.num_heads) {
             return Err(ModelError::Config {
                 field: "num_heads",
                 value: self.num_heads.to_string(),
@@ -55,7 +55,7 @@ impl ModelConfig {
         in_range("mlp_ratio", self.mlp_ratio, 1, 16)?;
         for (field, side) in [("image_height", self.image_height), ("image_width", self.image_width)] {
             in_range(field, side, self.patch_size, MAX_SIDE)?;
-            if side % self.patch_size != 0 {
+            if !side.is_multiple_of(self.patch_size) {
                 let fix = format!("use a multiple of patch_size {}", self.patch_size);
                 return Err(ModelError::Config { field, value: side.to_string(), fix });
             }

@@ -159,7 +159,7 @@ impl Storm {
 
     fn check_sizes(&self, cameras: usize, height: usize, width: usize) -> Result<(), ModelError> {
         let (patch, most) = (self.config.patch_size, self.config.num_cams);
-        if height == 0 || width == 0 || height % patch != 0 || width % patch != 0 {
+        if height == 0 || width == 0 || !height.is_multiple_of(patch) || !width.is_multiple_of(patch) {
             let text = format!("pictures are {width}x{height} pixels; both sides must be multiples of {patch}");
             return Err(ModelError::Input(text));
         }

@@ -72,11 +72,13 @@ impl SkyModel {
             SkyKind::Frequency64 => {
                 let mut e = [1f64; 6 * SKY_OCTAVES + 1];
                 let d = unit(direction);
-                for octave in 0..SKY_OCTAVES {
-                    for i in 0..3 {
-                        let angle = f64::from(1 << octave) * std::f64::consts::PI * d[i];
-                        e[6 * octave + i] = angle.sin();
-                        e[6 * octave + 3 + i] = angle.cos();
+                for i in 0..3 {
+                    let (mut sin, mut cos) = (std::f64::consts::PI * d[i]).sin_cos();
+                    for octave in 0..SKY_OCTAVES {
+                        e[6 * octave + i] = sin;
+                        e[6 * octave + 3 + i] = cos;
+                        // The next octave is twice the angle.
+                        (sin, cos) = (2.0 * sin * cos, 1.0 - 2.0 * sin * sin);
                     }
                 }
                 self.evaluate(&e)

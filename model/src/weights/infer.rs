@@ -52,7 +52,7 @@ pub fn infer_config(
         (config.image_height, config.image_width) = (rows.saturating_mul(patch), cols.saturating_mul(patch));
     } else {
         // No grid to keep: any size that is a multiple of the patch will do.
-        (config.image_height, config.image_width) = (patch * 20, patch * 30);
+        (config.image_height, config.image_width) = (patch.saturating_mul(20), patch.saturating_mul(30));
     }
     config.use_sky_token = shape("sky_token").is_some();
     config.use_affine_token = shape("affine_token").is_some();
@@ -113,12 +113,14 @@ fn grid(patches: usize, patch: usize, columns: Option<&[f32]>) -> Option<(usize,
     if let Some(width) = width {
         // Values are column + 0.5.
         let cols = width.ceil() as usize / patch;
-        if cols > 0 && patches % cols == 0 {
+        if cols > 0 && patches.is_multiple_of(cols) {
             return Some((patches / cols, cols));
         }
     }
     // Every divisor pair; at most MAX_SIDE rows matter, so the search is short whatever the file claims.
     let off = |rows: usize| ((patches as f64 / rows as f64 / rows as f64) / USUAL_ASPECT).ln().abs();
-    let rows = (1..=2048.min(patches)).filter(|rows| patches % rows == 0).min_by(|&a, &b| off(a).total_cmp(&off(b)))?;
+    let rows = (1..=2048.min(patches))
+        .filter(|rows| patches.is_multiple_of(*rows))
+        .min_by(|&a, &b| off(a).total_cmp(&off(b)))?;
     Some((rows, patches / rows))
 }

@@ -49,7 +49,7 @@ fn values(config: &ModelConfig, spec: &TensorSpec, seed: u64) -> Vec<f32> {
             let width = config.embed_dim;
             let unit = (width as f64).sqrt().recip();
             let depth_spread = 0.25 * (raw_depth(config, START_DEPTHS_M[1]) - raw_depth(config, START_DEPTHS_M[0]));
-            let spread = |i: usize| if (i / width) % channels == 0 { depth_spread } else { START_SPREAD };
+            let spread = |i: usize| if (i / width).is_multiple_of(channels) { depth_spread } else { START_SPREAD };
             (0..count).map(|i| (spread(i) * unit * cut_normal(&mut rng)) as f32).collect()
         }
         Init::GaussianHeadBias => {

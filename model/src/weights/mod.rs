@@ -35,6 +35,9 @@ const WRAPPERS: [&str; 2] = ["module.", "_orig_mod."];
 /// Most bytes of one tensor we read: 16 times the largest of the largest published model.
 const MAX_TENSOR_BYTES: usize = 1 << 30;
 
+/// Start of files of PyTorch before 1.6: a pickle of its magic number.
+const LEGACY_MAGIC: [u8; 8] = *b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46";
+
 /// An open weight file: names and shapes known, values read one tensor at a time.
 trait Source {
     /// Shapes by name as the file has it.
@@ -103,7 +106,7 @@ fn open(path: &Path) -> Result<Box<dyn Source>, WeightsError> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     if magic.starts_with(b"PK\x03\x04") {
         Ok(Box::new(torch::TorchFile::open(path)?))
-    } else if filled > 2 && magic[0] == 0x80 && matches!(extension.as_str(), "pth" | "pt" | "bin" | "ckpt") {
+    } else if magic == LEGACY_MAGIC || (magic[0] == 0x80 && matches!(extension.as_str(), "pth" | "pt" | "ckpt")) {
         let reason = "PyTorch's old format (before 1.6) is not read; in Python, torch.load it and torch.save it again";
         Err(WeightsError::format(path, reason))
     } else if filled == 8 && u64::from_le_bytes(magic) < MAX_TENSOR_BYTES as u64 {

@@ -134,6 +134,7 @@ fn other_files_are_refused_with_the_reason() {
     };
     let read = |path: &Path| message(load(path, None, &Device::Cpu).unwrap_err());
     assert!(read(&write("old.pth", b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.")).contains("old format"));
+    assert!(read(&write("old", b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.")).contains("old format"));
     assert!(read(&write("text.pth", b"hello world, this is text")).contains("neither"));
     assert!(read(&write("empty.safetensors", b"")).contains("neither"));
     assert!(read(&write("zip.pth", b"PK\x03\x04 and nothing")).contains("zip"));

@@ -75,10 +75,9 @@ impl TorchFile {
         let pickle_name = zip.file_names().filter_map(|n| Some(n.ok()?.into_owned())).find(is_pickle);
         let name = pickle_name.ok_or_else(|| bad("a zip without data.pkl: not saved by torch.save".into()))?;
         let folder = name.trim_end_matches("data.pkl").to_owned();
-        if let Ok(order) = entry(&mut zip, &format!("{folder}byteorder"), 16) {
-            if order != b"little" {
-                return Err(bad("was saved on a big-endian machine; save it on a little-endian one".into()));
-            }
+        // Files from before PyTorch 2.1 have no such entry and are little-endian.
+        if entry(&mut zip, &format!("{folder}byteorder"), 16).is_ok_and(|order| order != b"little") {
+            return Err(bad("was saved on a big-endian machine; save it on a little-endian one".into()));
         }
         let bytes = entry(&mut zip, &name, MAX_PICKLE_BYTES).map_err(bad)?;
         let pickle = Pickle::read(&bytes).map_err(|e| bad(format!("at byte {} of its pickle: {}", e.at, e.reason)))?;

@@ -2,20 +2,22 @@
 //! every channel is one multiply-add per row, so that more channels cost little.
 
 use super::settings::{ALPHA_FLOOR, ALPHA_MIN, TRANSMITTANCE_STOP};
-use super::simd::{dispatch, exp2_neg, fma};
+use super::simd::{dispatch, exp2_neg_lanes, fma, prefetch};
 use super::sort::{key_depth, key_slot};
-use super::tiles::{Chunk, Record, TILE_H, TILE_W};
+use super::tiles::{Chunk, ChunkView, Record, TILE_H, TILE_W};
 
 /// Pixels blended together.
 const WIDTH: usize = 8;
 /// Row pitch of the tile's buffers: a sweep may begin at the last pixel and run into the padding.
 const PITCH: usize = TILE_W + WIDTH;
-/// Numbers in one channel's buffer.
-const PLANE: usize = TILE_H * PITCH;
 /// Channels every picture has: `sum(w)` and `sum(w z)`.
 const BASE_PLANES: usize = 2;
 /// Splats fetched together, so that their cache misses overlap.
 const BATCH: usize = 32;
+/// Numbers in a cache line.
+const LINE_FLOATS: usize = 16;
+/// Sign bit of an f32.
+const SIGN: u32 = 1 << 31;
 
 /// A tile and the splats it shows.
 pub(crate) struct TileInput<'a> {
@@ -56,17 +58,20 @@ struct Cut {
     y1: usize,
 }
 
+/// A row of one plane.
+type Row = [f32; PITCH];
+
 /// Buffers of one tile, reused.
 pub(crate) struct Scratch {
     /// Transmittance; negated once the pixel is finished, 0 outside the picture.
-    transmittance: Box<[f32; PLANE]>,
-    /// `sum(w)`, `sum(w z)`, then the features, one plane each.
-    planes: Vec<f32>,
+    transmittance: [Row; TILE_H],
+    /// Per tile row: `sum(w)`, `sum(w z)`, then the features.
+    sums: Vec<Row>,
     /// Per row, a bit for each unfinished pixel.
     live: [u32; TILE_H],
-    weights: [[f32; WIDTH]; TILE_H],
+    /// Splats to blend now, and those to blend next.
     batch: Vec<Cut>,
-    batch_features: Vec<f32>,
+    fetched: Vec<Cut>,
     /// For sorting.
     pub(crate) spare_keys: Vec<u64>,
 }
@@ -76,42 +81,37 @@ const _: () = assert!(TILE_W == u32::BITS as usize, "a row of a tile is one u32 
 impl Scratch {
     pub(crate) fn new() -> Self {
         Self {
-            transmittance: Box::new([0.0; PLANE]),
-            planes: Vec::new(),
+            transmittance: [[0.0; PITCH]; TILE_H],
+            sums: Vec::new(),
             live: [0; TILE_H],
-            weights: [[0.0; WIDTH]; TILE_H],
             batch: Vec::with_capacity(BATCH),
-            batch_features: Vec::new(),
+            fetched: Vec::with_capacity(BATCH),
             spare_keys: Vec::new(),
         }
     }
 
-    fn reset(&mut self, width: usize, height: usize, feature_count: usize) {
-        self.planes.clear();
-        self.planes.resize(PLANE * (BASE_PLANES + feature_count), 0.0);
-        self.batch_features.resize(BATCH * feature_count, 0.0);
+    fn reset(&mut self, width: usize, height: usize, planes: usize) {
+        self.sums.clear();
+        self.sums.resize(TILE_H * planes, [0.0; PITCH]);
         for y in 0..TILE_H {
             let row_width = if y < height { width.min(TILE_W) } else { 0 };
             self.live[y] = low_bits(row_width);
-            let row = &mut self.transmittance[y * PITCH..(y + 1) * PITCH];
-            row[..row_width].fill(1.0);
-            row[row_width..].fill(0.0);
+            self.transmittance[y][..row_width].fill(1.0);
+            self.transmittance[y][row_width..].fill(0.0);
         }
     }
 
     /// Writes the tile into its rows of the picture.
     pub(crate) fn write(&self, rows: &mut [RowOut], feature_count: usize) {
-        let (base, features) = self.planes.split_at(BASE_PLANES * PLANE);
-        for (y, row) in rows.iter_mut().enumerate() {
-            let pixels = row.alpha.len();
-            let weight = &base[y * PITCH..][..pixels];
-            let weighted_depth = &base[PLANE + y * PITCH..][..pixels];
-            for x in 0..pixels {
-                row.alpha[x] = weight[x].min(1.0);
-                row.depth[x] = weighted_depth[x] / weight[x].max(ALPHA_FLOOR);
+        let planes = BASE_PLANES + feature_count;
+        for (row, sums) in rows.iter_mut().zip(self.sums.chunks_exact(planes)) {
+            let [weight, weighted_depth, features @ ..] = sums else { continue };
+            let pixels = row.alpha.iter_mut().zip(row.depth.iter_mut());
+            for ((alpha, depth), (w, wz)) in pixels.zip(weight.iter().zip(weighted_depth)) {
+                *alpha = w.min(1.0);
+                *depth = wz / w.max(ALPHA_FLOOR);
             }
-            for channel in 0..feature_count {
-                let source = &features[channel * PLANE + y * PITCH..][..pixels];
+            for (channel, source) in features.iter().enumerate() {
                 for (pixel, &value) in row.features.chunks_exact_mut(feature_count).zip(source) {
                     // Weights add up to 1 give or take rounding, which features near f32::MAX do not forgive.
                     pixel[channel] = value.clamp(f32::MIN, f32::MAX);
@@ -134,13 +134,22 @@ dispatch!(
 
 #[inline(always)]
 fn blend_tile_kernel<const FMA: bool>(input: &TileInput, scratch: &mut Scratch) {
-    scratch.reset(input.width, input.height, input.feature_count);
-    for keys in input.keys.chunks(BATCH) {
-        fetch(input, keys, scratch);
-        for j in 0..scratch.batch.len() {
-            let cut = scratch.batch[j];
-            if is_live(&scratch.live, &cut) {
-                blend_splat::<FMA>(input, &cut, j, scratch);
+    scratch.reset(input.width, input.height, BASE_PLANES + input.feature_count);
+    let batch = |index: usize| {
+        let keys = input.keys.get(index * BATCH..).unwrap_or_default();
+        keys.get(..BATCH).unwrap_or(keys)
+    };
+    // While one batch is blended, the next has its features on the way and the one after that its records.
+    prefetch_records(input, batch(0));
+    prefetch_records(input, batch(1));
+    fetch(input, batch(0), scratch);
+    for index in 0..input.keys.len().div_ceil(BATCH) {
+        std::mem::swap(&mut scratch.batch, &mut scratch.fetched);
+        prefetch_records(input, batch(index + 2));
+        fetch(input, batch(index + 1), scratch);
+        for cut in &scratch.batch {
+            if is_live(&scratch.live, cut) {
+                blend_splat::<FMA>(input, cut, &mut scratch.transmittance, &mut scratch.sums, &mut scratch.live);
             }
         }
         if scratch.live.iter().fold(0, |a, b| a | b) == 0 {
@@ -156,15 +165,29 @@ fn is_live(live: &[u32; TILE_H], cut: &Cut) -> bool {
     live[cut.y0..cut.y1].iter().fold(0, |a, b| a | b) & columns != 0
 }
 
-/// Copies the records, and then the features, of those splats of a batch that may still add something.
+/// The chunk and the position in it that a key stands for.
+#[inline(always)]
+fn locate<'a>(input: &TileInput<'a>, key: u64) -> (&'a ChunkView, usize) {
+    let slot = key_slot(key);
+    (&input.chunks[slot >> input.chunk_bits].views[input.view], slot & ((1 << input.chunk_bits) - 1))
+}
+
+/// Asks for the records and ids of a batch.
+#[inline(always)]
+fn prefetch_records(input: &TileInput, keys: &[u64]) {
+    for &key in keys {
+        let (view, at) = locate(input, key);
+        prefetch(&view.records, at);
+        prefetch(&view.ids, at);
+    }
+}
+
+/// Reads the records of a batch, keeps the splats that may still add something, and asks for their features.
 #[inline(always)]
 fn fetch(input: &TileInput, keys: &[u64], scratch: &mut Scratch) {
-    scratch.batch.clear();
-    let slot_mask = (1usize << input.chunk_bits) - 1;
+    scratch.fetched.clear();
     for &key in keys {
-        let slot = key_slot(key);
-        let view = &input.chunks[slot >> input.chunk_bits].views[input.view];
-        let at = slot & slot_mask;
+        let (view, at) = locate(input, key);
         let record = view.records[at];
         let cut = Cut {
             record,
@@ -176,91 +199,150 @@ fn fetch(input: &TileInput, keys: &[u64], scratch: &mut Scratch) {
             y1: usize::from(record.y1).min(input.y0 + input.height) - input.y0,
         };
         if is_live(&scratch.live, &cut) {
-            scratch.batch.push(cut);
-        }
-    }
-    let channels = input.feature_count;
-    if channels > 0 {
-        for (cut, row) in scratch.batch.iter().zip(scratch.batch_features.chunks_exact_mut(channels)) {
-            row.copy_from_slice(&input.features[cut.id as usize * channels..][..channels]);
+            let first = cut.id as usize * input.feature_count;
+            for at in (first..first + input.feature_count).step_by(LINE_FLOATS) {
+                prefetch(input.features, at);
+            }
+            scratch.fetched.push(cut);
         }
     }
 }
+
+/// `0` for the lanes below the index, infinity from there on.
+const EDGE: [[f32; WIDTH]; WIDTH + 1] = {
+    let mut table = [[f32::INFINITY; WIDTH]; WIDTH + 1];
+    let mut columns = 0;
+    while columns <= WIDTH {
+        let mut l = 0;
+        while l < columns {
+            table[columns][l] = 0.0;
+            l += 1;
+        }
+        columns += 1;
+    }
+    table
+};
 
 /// Blends one splat, strip by strip of eight columns.
 #[inline(always)]
-fn blend_splat<const FMA: bool>(input: &TileInput, cut: &Cut, in_batch: usize, scratch: &mut Scratch) {
+fn blend_splat<const FMA: bool>(
+    input: &TileInput,
+    cut: &Cut,
+    transmittance: &mut [Row; TILE_H],
+    sums: &mut [Row],
+    live: &mut [u32; TILE_H],
+) {
     let record = &cut.record;
-    let features = &scratch.batch_features[in_batch * input.feature_count..][..input.feature_count];
-    // The tile's corner seen from the box's corner: small whole numbers, exact in f32.
-    let from_box_x = input.x0 as f32 - f32::from(record.x0);
-    let from_box_y = input.y0 as f32 - f32::from(record.y0);
-    let rows = cut.y1 - cut.y0;
+    let features = &input.features[cut.id as usize * input.feature_count..][..input.feature_count];
+    let planes = BASE_PLANES + features.len();
+    // The tile's corner seen from the centre; the whole numbers are exact, so small boxes keep all digits.
+    let left = (input.x0 as f32 - f32::from(record.x0)) + 0.5;
+    let top = (input.y0 as f32 - f32::from(record.y0)) + 0.5;
     for strip in (cut.x0..cut.x1).step_by(WIDTH) {
-        let columns = cut.x1 - strip;
-        let mut dx = [0.0f32; WIDTH];
+        // Outside the box (the rule's tiles may cut the ellipse short) alpha becomes 0.
+        let mut dx = EDGE[(cut.x1 - strip).min(WIDTH)];
+        let first = left + strip as f32 - record.u;
         for l in 0..WIDTH {
-            let offset = from_box_x + (strip + l) as f32 + 0.5 - record.u;
-            // Outside the box (the rule's tiles may cut the ellipse short) alpha becomes 0.
-            dx[l] = if l < columns { offset } else { f32::INFINITY };
+            dx[l] += first + l as f32;
         }
         let mut finished = [0u32; WIDTH];
-        for row in 0..rows {
-            let dy = from_box_y + (cut.y0 + row) as f32 + 0.5 - record.v;
+        let rows = transmittance[cut.y0..cut.y1].iter_mut();
+        let sums = sums[cut.y0 * planes..].chunks_exact_mut(planes);
+        for ((y, row), sums) in (cut.y0..cut.y1).zip(rows).zip(sums) {
+            let dy = top + y as f32 - record.v;
             let shift = record.slope * dy;
             let along = record.along * dy * dy;
-            let at = (cut.y0 + row) * PITCH + strip;
-            let Some(transmittance) = scratch.transmittance[at..].first_chunk_mut::<WIDTH>() else { continue };
-            let weights = &mut scratch.weights[row];
+            let Some(before) = row[strip..].first_chunk_mut::<WIDTH>() else { continue };
+            let mut falloff = [0.0; WIDTH];
             for l in 0..WIDTH {
                 let across = dx[l] - shift;
-                let exponent = fma::<FMA>(record.across * across, across, along);
-                let falloff = record.opacity * exp2_neg::<FMA>(exponent);
-                let alpha = if falloff < input.alpha_cap { falloff } else { input.alpha_cap };
-                let before = transmittance[l];
-                let hit = (alpha >= ALPHA_MIN) & (before > 0.0);
-                let weight = if hit { alpha * before } else { 0.0 };
-                let after = before - weight;
-                let stop = hit & (after <= TRANSMITTANCE_STOP);
-                transmittance[l] = if stop { -before } else { after };
-                weights[l] = if stop { 0.0 } else { weight };
-                finished[l] |= u32::from(stop);
+                falloff[l] = fma::<FMA>(record.across * across, across, along);
+            }
+            exp2_neg_lanes::<FMA>(&mut falloff);
+            let step = shade(&falloff, before, record.opacity, input.alpha_cap);
+            *before = step.after;
+            for l in 0..WIDTH {
+                finished[l] |= step.finished[l];
+            }
+            let [weight_sum, weighted_depth, feature_sums @ ..] = sums else { continue };
+            add::<FMA>(weight_sum, strip, &step.weight, 1.0);
+            add::<FMA>(weighted_depth, strip, &step.weight, cut.depth);
+            for (sum, &feature) in feature_sums.iter_mut().zip(features) {
+                add::<FMA>(sum, strip, &step.weight, feature);
             }
         }
-        let planes = &mut scratch.planes;
-        let at = cut.y0 * PITCH + strip;
-        let weights = &scratch.weights[..rows];
-        accumulate::<FMA>(&mut planes[at..], weights, 1.0);
-        accumulate::<FMA>(&mut planes[PLANE + at..], weights, cut.depth);
-        for (channel, &value) in features.iter().enumerate() {
-            accumulate::<FMA>(&mut planes[(BASE_PLANES + channel) * PLANE + at..], weights, value);
-        }
         if finished.iter().fold(0, |a, b| a | b) != 0 {
-            retire(&mut scratch.live, &scratch.transmittance, cut.y0..cut.y1, strip);
+            retire(live, transmittance, cut.y0..cut.y1, strip);
         }
     }
 }
 
-/// `plane += weights * value` over the rows of a strip.
+/// `sum += weight * value` at eight pixels of a row.
 #[inline(always)]
-fn accumulate<const FMA: bool>(plane: &mut [f32], weights: &[[f32; WIDTH]], value: f32) {
-    for (row, weight) in weights.iter().enumerate() {
-        let Some(target) = plane[row * PITCH..].first_chunk_mut::<WIDTH>() else { continue };
+fn add<const FMA: bool>(sum: &mut Row, strip: usize, weight: &[f32; WIDTH], value: f32) {
+    if let Some(sum) = sum[strip..].first_chunk_mut::<WIDTH>() {
         for l in 0..WIDTH {
-            target[l] = fma::<FMA>(weight[l], value, target[l]);
+            sum[l] = fma::<FMA>(weight[l], value, sum[l]);
         }
     }
+}
+
+/// What a splat does to eight pixels.
+struct Step {
+    weight: [f32; WIDTH],
+    after: [f32; WIDTH],
+    /// All ones where the splat finishes the pixel, else 0.
+    finished: [u32; WIDTH],
+}
+
+/// Weights of a splat whose falloff and whose pixels' transmittance are given. One operation per loop, conditions as
+/// bit masks: straight-line code the compiler reliably turns into vectors.
+#[inline(always)]
+fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap: f32) -> Step {
+    let (mut alpha, mut hit, mut weight) = ([0.0f32; WIDTH], [0u32; WIDTH], [0.0f32; WIDTH]);
+    let (mut after, mut finished) = ([0.0f32; WIDTH], [0u32; WIDTH]);
+    for l in 0..WIDTH {
+        alpha[l] = opacity * falloff[l];
+    }
+    for l in 0..WIDTH {
+        alpha[l] = if alpha[l] < alpha_cap { alpha[l] } else { alpha_cap };
+    }
+    for l in 0..WIDTH {
+        hit[l] = mask(alpha[l] >= ALPHA_MIN) & mask(before[l] > 0.0);
+    }
+    for l in 0..WIDTH {
+        weight[l] = f32::from_bits((alpha[l] * before[l]).to_bits() & hit[l]);
+    }
+    for l in 0..WIDTH {
+        after[l] = before[l] - weight[l];
+    }
+    for l in 0..WIDTH {
+        finished[l] = mask(after[l] <= TRANSMITTANCE_STOP) & hit[l];
+    }
+    for l in 0..WIDTH {
+        weight[l] = f32::from_bits(weight[l].to_bits() & !finished[l]);
+    }
+    for l in 0..WIDTH {
+        // A finished pixel keeps its transmittance, negated.
+        let kept = (before[l].to_bits() ^ SIGN) & finished[l];
+        after[l] = f32::from_bits((after[l].to_bits() & !finished[l]) | kept);
+    }
+    Step { weight, after, finished }
+}
+
+/// All ones or 0.
+#[inline(always)]
+fn mask(condition: bool) -> u32 {
+    0u32.wrapping_sub(u32::from(condition))
 }
 
 /// Clears the live bits of the pixels a strip has finished.
 #[cold]
 #[inline(never)]
-fn retire(live: &mut [u32; TILE_H], transmittance: &[f32; PLANE], rows: std::ops::Range<usize>, strip: usize) {
-    for row in rows {
-        for x in strip..(strip + WIDTH).min(TILE_W) {
-            if transmittance[row * PITCH + x] < 0.0 {
-                live[row] &= !(1 << x);
-            }
+fn retire(live: &mut [u32; TILE_H], transmittance: &[Row; TILE_H], rows: std::ops::Range<usize>, strip: usize) {
+    for (bits, row) in live[rows.clone()].iter_mut().zip(&transmittance[rows]) {
+        for (x, &t) in row.iter().enumerate().skip(strip).take(WIDTH.min(TILE_W - strip)) {
+            *bits &= !(u32::from(t < 0.0) << x);
         }
     }
 }

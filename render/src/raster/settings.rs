@@ -14,8 +14,8 @@ pub const ALPHA_FLOOR: f32 = 1e-10;
 pub const LATEST_EXTENT: f64 = 3.33;
 /// Floor of the discriminant in gsplat's larger eigenvalue.
 pub const DISCRIMINANT_FLOOR: f64 = 0.01;
-/// Opacities above this are taken as this: an opacity is at most 1, and up to here `exp2` needs no denormal numbers.
-pub const OPACITY_CEILING: f32 = 1e30;
+/// Opacities above this are taken as this: an opacity is at most 1, and up to here the fast `exp2` may end at `2^-100`.
+pub const OPACITY_CEILING: f32 = 1e18;
 
 /// Whose splatting rules are followed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

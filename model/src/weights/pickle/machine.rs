@@ -1,155 +1,23 @@
-//! A reader for the pickles inside PyTorch checkpoints that only ever builds plain data.
-//!
-//! Pickle is a program for a stack machine, and Python's own reader calls whatever functions the program names. This one
-//! has no functions to call: the few constructors a checkpoint needs are recognised by name and turned into data, others
-//! make the file refused. Values live in an arena and refer to each other by index, so shared and cyclic structures cost
-//! nothing and no operation allocates more than the bytes it consumed.
+//! The stack machine: one operation after the other, each making at most one value.
 
 use std::collections::HashMap;
 
-/// Index of a value in the arena.
-pub(super) type Id = usize;
+use super::classes::{Kind, kind};
+use super::{Id, Node, PickleError};
 
-/// A value.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum Node {
-    None,
-    Bool(bool),
-    Int(i64),
-    Float(f64),
-    Str(String),
-    Bytes,
-    Tuple(Vec<Id>),
-    List(Vec<Id>),
-    Dict(Vec<(Id, Id)>),
-    Class(String, String),
-    /// A storage reference: the tuple PyTorch writes for it.
-    Storage(Id),
-    /// `_rebuild_tensor_v2`'s arguments.
-    Tensor(Id),
-    /// An object whose content does not matter here.
-    Inert,
-}
-
-/// Why a pickle is refused: byte offset and reason.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct PickleError {
-    pub at: usize,
-    pub reason: String,
-}
-
-/// Classes and functions whose results are data; `module.name`, the module as Python 2 and 3 spell it.
-const INERT: [&str; 27] = [
-    "argparse.Namespace",
-    "builtins.set",
-    "builtins.frozenset",
-    "builtins.list",
-    "builtins.tuple",
-    "builtins.slice",
-    "builtins.complex",
-    "builtins.bytearray",
-    "builtins.int",
-    "builtins.float",
-    "builtins.bool",
-    "builtins.str",
-    "builtins.object",
-    "_codecs.encode",
-    "collections.deque",
-    "collections.Counter",
-    "datetime.datetime",
-    "datetime.timedelta",
-    "pathlib.PosixPath",
-    "pathlib.PurePosixPath",
-    "pathlib.WindowsPath",
-    "pathlib.PureWindowsPath",
-    "numpy.dtype",
-    "numpy.core.multiarray.scalar",
-    "numpy._core.multiarray.scalar",
-    "torch.Size",
-    "torch.device",
-];
-
-/// Names that mean a dictionary.
-const DICTS: [&str; 3] = ["collections.OrderedDict", "collections.defaultdict", "builtins.dict"];
-
-/// Functions that build tensors, and wrappers that add nothing to the tensor they are given.
-const TENSOR: &str = "torch._utils._rebuild_tensor_v2";
-const PARAMETERS: [&str; 2] = ["torch._utils._rebuild_parameter", "torch._utils._rebuild_parameter_with_state"];
-
-enum Kind {
-    Inert,
-    Dict,
-    Tensor,
-    Parameter,
-    /// May be named (a storage type, a dtype) but not called.
-    NameOnly,
-}
-
-fn kind(module: &str, name: &str) -> Option<Kind> {
-    let module = if module == "__builtin__" { "builtins" } else { module };
-    let full = format!("{module}.{name}");
-    let plain_name = name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
-    if full == TENSOR {
-        Some(Kind::Tensor)
-    } else if PARAMETERS.contains(&full.as_str()) {
-        Some(Kind::Parameter)
-    } else if DICTS.contains(&full.as_str()) {
-        Some(Kind::Dict)
-    } else if INERT.contains(&full.as_str()) {
-        Some(Kind::Inert)
-    } else if (module == "torch" || module == "torch.storage") && plain_name && is_torch_name(name) {
-        Some(Kind::NameOnly)
-    } else {
-        None
-    }
-}
-
-fn is_torch_name(name: &str) -> bool {
-    name.ends_with("Storage")
-        || ["float", "half", "bfloat", "double", "int", "uint", "bool", "complex", "long", "short"]
-            .iter()
-            .any(|p| name.strip_prefix(p).is_some_and(|rest| rest.chars().all(|c| c.is_ascii_digit())))
-}
-
-/// A read pickle.
-#[derive(Debug)]
-pub(super) struct Pickle {
-    nodes: Vec<Node>,
-    root: Id,
-}
-
-impl Pickle {
-    /// Reads a whole pickle, protocols 2 to 5.
-    pub fn read(bytes: &[u8]) -> Result<Self, PickleError> {
-        let mut machine = Machine {
-            bytes,
-            at: 0,
-            op_at: 0,
-            nodes: Vec::new(),
-            stack: Vec::new(),
-            marks: Vec::new(),
-            memo: HashMap::new(),
-        };
-        let root = machine.run()?;
-        Ok(Self { nodes: machine.nodes, root })
-    }
-
-    /// The outermost value.
-    pub fn root(&self) -> Id {
-        self.root
-    }
-
-    /// A value; ids come from this pickle, a foreign one reads as `None`.
-    pub fn node(&self, id: Id) -> &Node {
-        self.nodes.get(id).unwrap_or(&Node::None)
-    }
-
-    /// The value of a string key in a dictionary, the last one if it appears twice.
-    pub fn item(&self, dict: Id, key: &str) -> Option<Id> {
-        let Node::Dict(items) = self.node(dict) else { return None };
-        let found = items.iter().rev().find(|(k, _)| matches!(self.node(*k), Node::Str(s) if s == key));
-        found.map(|(_, value)| *value)
-    }
+/// Runs a whole pickle and returns its values and the outermost one.
+pub(super) fn run(bytes: &[u8]) -> Result<(Vec<Node>, Id), PickleError> {
+    let mut machine = Machine {
+        bytes,
+        at: 0,
+        op_at: 0,
+        nodes: Vec::new(),
+        stack: Vec::new(),
+        marks: Vec::new(),
+        memo: HashMap::new(),
+    };
+    let root = machine.run()?;
+    Ok((machine.nodes, root))
 }
 
 struct Machine<'a> {
@@ -217,12 +85,10 @@ impl<'a> Machine<'a> {
 
     fn pop(&mut self) -> Step<Id> {
         let floor = self.marks.last().copied().unwrap_or(0);
-        if self.stack.len() > floor {
-            if let Some(id) = self.stack.pop() {
-                return Ok(id);
-            }
+        match self.stack.pop() {
+            Some(id) if self.stack.len() >= floor => Ok(id),
+            _ => self.fail("the stack is empty"),
         }
-        self.fail("the stack is empty")
     }
 
     fn pop_mark(&mut self) -> Step<Vec<Id>> {
@@ -286,7 +152,7 @@ impl<'a> Machine<'a> {
     }
 
     fn set_items(&mut self, ids: Vec<Id>) -> Step<()> {
-        if ids.len() % 2 != 0 {
+        if !ids.len().is_multiple_of(2) {
             return self.fail("a key without a value");
         }
         match self.top()? {
@@ -476,69 +342,5 @@ impl<'a> Machine<'a> {
         let mut all = [if negative { 0xff } else { 0 }; 8];
         all[..bytes.len()].copy_from_slice(bytes);
         self.push(Node::Int(i64::from_le_bytes(all)))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    #[test]
-    fn a_call_of_anything_else_is_refused_by_name() {
-        for program in
-            [&b"\x80\x02cos\nsystem\nX\x02\x00\x00\x00ls\x85R."[..], b"\x80\x04\x8c\x02os\x8c\x06system\x93."]
-        {
-            let error = Pickle::read(program).unwrap_err();
-            assert!(error.reason.contains("os.system"), "{error:?}");
-        }
-        for name in ["eval", "exec", "getattr", "__import__", "open"] {
-            let program = format!("\x02cbuiltins\n{name}\n)R.");
-            let program = [&[0x80], program.as_bytes()].concat();
-            assert!(Pickle::read(&program).unwrap_err().reason.contains(name));
-        }
-        // A storage class may be named, not called.
-        assert!(Pickle::read(b"\x80\x02ctorch\nFloatStorage\n.").is_ok());
-        assert!(Pickle::read(b"\x80\x02ctorch\nFloatStorage\n)R.").is_err());
-    }
-
-    #[test]
-    fn numbers_strings_and_sharing() {
-        // {"a": (1, -2, 2.5, True), "b": the same tuple}
-        let mut program = b"\x80\x02}(X\x01\x00\x00\x00a(K\x01J\xfe\xff\xff\xffG".to_vec();
-        program.extend(2.5f64.to_be_bytes());
-        program.extend(b"\x88tq\x05X\x01\x00\x00\x00bh\x05u.");
-        let pickle = Pickle::read(&program).unwrap();
-        let a = pickle.item(pickle.root(), "a").unwrap();
-        assert_eq!(pickle.item(pickle.root(), "b"), Some(a));
-        let Node::Tuple(ids) = pickle.node(a) else { panic!("no tuple") };
-        let values: Vec<&Node> = ids.iter().map(|&id| pickle.node(id)).collect();
-        assert_eq!(values, [&Node::Int(1), &Node::Int(-2), &Node::Float(2.5), &Node::Bool(true)]);
-        let long = Pickle::read(b"\x80\x02\x8a\x02\x00\x80.").unwrap();
-        assert_eq!(long.node(long.root()), &Node::Int(-32768));
-    }
-
-    #[test]
-    fn claimed_lengths_do_not_allocate() {
-        for program in
-            [&b"\x80\x04\x8d\xff\xff\xff\xff\xff\xff\xff\x7f"[..], b"\x80\x02X\xff\xff\xff\xffab", b"\x80\x02."]
-        {
-            assert!(Pickle::read(program).is_err());
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn random_programs_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
-            let _ = Pickle::read(&bytes);
-        }
-
-        #[test]
-        fn random_operations_never_panic(ops in prop::collection::vec(
-            prop::sample::select(&b"\x80\x02(0124NKh)]}talesud.qbQR\x81\x85\x86\x87\x93\x94\x8f\x90\x91"[..]), 0..120))
-        {
-            let _ = Pickle::read(&ops);
-        }
     }
 }
