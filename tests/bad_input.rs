@@ -246,7 +246,8 @@ fn odd_bags_are_refused_with_a_reason() {
     assert!(bags.len() > 20, "only {} bags found", bags.len());
     let dir = tempfile::tempdir().unwrap();
     for bag in bags {
-        let output = storm(&["--quiet", "replay", bag.to_str().unwrap(), "--out", dir.path().join("o").to_str().unwrap()]);
+        let output =
+            storm(&["--quiet", "replay", bag.to_str().unwrap(), "--out", dir.path().join("o").to_str().unwrap()]);
         let (code, said) = (code(&output), stderr(&output));
         assert_eq!(code, 2, "{}: {said}", bag.display());
         assert_eq!(said.lines().count(), 1, "{}: {said}", bag.display());

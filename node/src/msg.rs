@@ -3,6 +3,8 @@
 //! Field meaning follows the ROS 2 interface definitions; stamps are nanoseconds since the epoch of whatever clock wrote
 //! them (wall or simulated), so they can be anything from 0 up.
 
+use storm_render::Intrinsics;
+
 use crate::rigid::Rigid;
 
 /// `std_msgs/Header`.
@@ -69,6 +71,28 @@ pub struct CameraInfo {
     pub binning_y: u32,
     /// Region of interest: x offset, y offset, height, width (all 0: the whole picture).
     pub roi: [u32; 4],
+}
+
+impl CameraInfo {
+    /// Of an undistorted picture.
+    ///
+    /// ROS follows OpenCV, where the centre of the first pixel is 0.0; ours puts it at 0.5, so the principal point moves by
+    /// half a pixel.
+    pub fn pinhole(intrinsics: &Intrinsics, header: Header) -> Self {
+        let (fx, fy) = (f64::from(intrinsics.fx), f64::from(intrinsics.fy));
+        let (cx, cy) = (f64::from(intrinsics.cx) - 0.5, f64::from(intrinsics.cy) - 0.5);
+        Self {
+            header,
+            height: intrinsics.height as u32,
+            width: intrinsics.width as u32,
+            distortion_model: "plumb_bob".into(),
+            d: vec![0.0; 5],
+            k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+            r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+            ..Self::default()
+        }
+    }
 }
 
 /// `geometry_msgs/TransformStamped`, also the element of `tf2_msgs/TFMessage`.

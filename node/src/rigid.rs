@@ -78,6 +78,13 @@ impl Rigid {
     }
 }
 
+impl From<&glam::DAffine3> for Rigid {
+    /// From the matrix form of a rigid transform.
+    fn from(t: &glam::DAffine3) -> Self {
+        Self { rotation: DQuat::from_mat3(&t.matrix3).normalize(), translation: t.translation }
+    }
+}
+
 impl std::ops::Mul for Rigid {
     type Output = Self;
     /// Composition, `a_from_b * b_from_c = a_from_c`.

@@ -41,7 +41,8 @@ pub fn shared(what: &str) -> Option<PathBuf> {
 pub fn synth(out: &Path, seed: u64, seconds: &str, more: &[&str]) {
     let seed = seed.to_string();
     let out = out.to_str().expect("a plain path");
-    let mut args = vec!["synth", "--seed", &seed, "--seconds", seconds, "--width", "120", "--height", "80", "--out", out];
+    let mut args =
+        vec!["synth", "--seed", &seed, "--seconds", seconds, "--width", "120", "--height", "80", "--out", out];
     args.extend(more);
     let output = storm(&args);
     assert_eq!(code(&output), 0, "{}", stderr(&output));
@@ -49,7 +50,8 @@ pub fn synth(out: &Path, seed: u64, seconds: &str, more: &[&str]) {
 
 /// Replays a bag into `out` with a short window and small pictures, so that a test takes seconds.
 pub fn replay(bag: &Path, out: &Path, more: &[&str]) -> Output {
-    let mut args = vec!["--quiet", "replay", bag.to_str().expect("a plain path"), "--out", out.to_str().expect("a plain path")];
+    let mut args =
+        vec!["--quiet", "replay", bag.to_str().expect("a plain path"), "--out", out.to_str().expect("a plain path")];
     args.extend(["--set", "model.image_width=48", "--set", "model.image_height=32"]);
     args.extend(more);
     storm(&args)

@@ -6,7 +6,7 @@
 use glam::{DQuat, DVec3};
 
 use super::read::{CdrError, CdrReader};
-use crate::msg::{CameraInfo, PointCloud2, PointField, CompressedImage, Header, Image, PoseStamped, TransformStamped};
+use crate::msg::{CameraInfo, CompressedImage, Header, Image, PointCloud2, PointField, PoseStamped, TransformStamped};
 use crate::rigid::Rigid;
 
 /// Nanoseconds in a second.

@@ -155,7 +155,8 @@ fn time_model(name: &str, runs: usize) -> Result<Setting> {
         let mut once = Timings::default();
         let start = Instant::now();
         let scene = once.time("network", || engine.step(&window, &cameras))?;
-        let targets: Vec<(View, Option<usize>)> = views_of(&window.steps[window.steps.len() - 1], &window.map_from_anchor, &cameras);
+        let targets: Vec<(View, Option<usize>)> =
+            views_of(&window.steps[window.steps.len() - 1], &window.map_from_anchor, &cameras);
         let want = Want { flow: true, motion: true };
         once.time("render", || engine.render(&scene, &targets, newest_time_sec(&window), want))?;
         once.add("step", start.elapsed().as_secs_f64() * 1e3);

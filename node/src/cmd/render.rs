@@ -83,9 +83,14 @@ pub fn run(args: &Args) -> Result<Outcome> {
     let view = View::from_pose(local_from_camera.to_f32(), intrinsics);
     let picture = draw(&saved, &view, args.time)?;
     if !picture.alpha.iter().any(|&a| a > 0.0) {
-        tracing::warn!("nothing is in view from there; the map's own position is {:?}", saved.map_from_local.translation);
+        tracing::warn!(
+            "nothing is in view from there; the map's own position is {:?}",
+            saved.map_from_local.translation
+        );
     }
-    finish(&picture, args.what)?.write_png(&args.out).with_context(|| format!("cannot write {}", args.out.display()))?;
+    finish(&picture, args.what)?
+        .write_png(&args.out)
+        .with_context(|| format!("cannot write {}", args.out.display()))?;
     println!("{}", args.out.display());
     Ok(Outcome::Done)
 }
@@ -106,10 +111,15 @@ fn draw(saved: &SavedGaussians, view: &View, time_sec: f32) -> Result<RasterPict
     let cloud = &saved.cloud;
     let still = [0.0f32; 3];
     let velocity = |i: usize| saved.velocities.get(i).unwrap_or(&still);
-    let move_by = |(i, p): (usize, &[f32; 3])| -> [f32; 3] { std::array::from_fn(|k| p[k] + time_sec * velocity(i)[k]) };
+    let move_by =
+        |(i, p): (usize, &[f32; 3])| -> [f32; 3] { std::array::from_fn(|k| p[k] + time_sec * velocity(i)[k]) };
     let means: Vec<[f32; 3]> = cloud.positions.iter().enumerate().map(move_by).collect();
-    let features: Vec<f32> =
-        cloud.colors01.iter().enumerate().flat_map(|(i, c)| c.iter().chain(velocity(i)).copied().collect::<Vec<_>>()).collect();
+    let features: Vec<f32> = cloud
+        .colors01
+        .iter()
+        .enumerate()
+        .flat_map(|(i, c)| c.iter().chain(velocity(i)).copied().collect::<Vec<_>>())
+        .collect();
     let splats = Splats {
         means: &means,
         quats: &cloud.quats,

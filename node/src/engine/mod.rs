@@ -10,8 +10,8 @@ use candle_core::Device;
 use storm_model::config::ModelConfig;
 use storm_model::scene::{RenderedView, Scene, Want};
 use storm_model::{ClipBatch, PixelLayout, Storm, ViewInput};
-use storm_render::{Intrinsics, View};
 use storm_render::raster::{CpuRasterizer, RasterSettings};
+use storm_render::{Intrinsics, View};
 
 use crate::config::ModelConfigSection;
 use crate::rigid::Rigid;
@@ -47,7 +47,8 @@ impl ModelSource {
             return Ok(Self::Untrained { config: Box::new(config), seed: section.untrained_seed });
         }
         let path = Path::new(&section.weights);
-        let model = Storm::load(path, &device(&section.device)?).with_context(|| format!("cannot use weights {}", path.display()))?;
+        let model = Storm::load(path, &device(&section.device)?)
+            .with_context(|| format!("cannot use weights {}", path.display()))?;
         let name = path.file_name().map_or_else(|| section.weights.clone(), |n| n.to_string_lossy().into_owned());
         Ok(Self::Loaded { model: Box::new(model), name })
     }
@@ -127,8 +128,11 @@ impl Engine {
 
     /// Runs the network on one window: Gaussians in the window's anchor frame, sky and exposure.
     pub fn step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
-        let pictures: Vec<Vec<Vec<f32>>> =
-            window.steps.iter().map(|set| set.frames.iter().map(|f| network_colors(&f.item.rgb.data)).collect()).collect();
+        let pictures: Vec<Vec<Vec<f32>>> = window
+            .steps
+            .iter()
+            .map(|set| set.frames.iter().map(|f| network_colors(&f.item.rgb.data)).collect())
+            .collect();
         let views: Vec<Vec<ViewInput>> = (0..window.steps.len())
             .map(|t| {
                 let view = |c: usize| ViewInput {
@@ -145,7 +149,13 @@ impl Engine {
     }
 
     /// Draws a scene: `targets` are camera index (for its exposure) and view in the anchor frame.
-    pub fn render(&mut self, scene: &Scene, targets: &[(View, Option<usize>)], time_sec: f32, want: Want) -> Result<Vec<RenderedView>> {
+    pub fn render(
+        &mut self,
+        scene: &Scene,
+        targets: &[(View, Option<usize>)],
+        time_sec: f32,
+        want: Want,
+    ) -> Result<Vec<RenderedView>> {
         Ok(scene.render(&mut self.raster, targets, time_sec, want)?)
     }
 }

@@ -234,7 +234,8 @@ impl Scorer {
             let stamp_ns = set.frames[camera].stamp_ns;
             // Each camera at its own stamp.
             let time_sec = (stamp_ns.saturating_sub(first_ns) as f64 * 1e-9) as f32;
-            let views = step.scene.render(&mut self.raster, &[target], time_sec, Want { flow: false, motion: false })?;
+            let views =
+                step.scene.render(&mut self.raster, &[target], time_sec, Want { flow: false, motion: false })?;
             let Some(view) = views.first() else { continue };
             let size = (view.width, view.height);
             let true01 = unit(&set.frames[camera].item.rgb.data);

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use tracing::warn;
 
 use crate::config::Config;
+use crate::source::Rig;
 use crate::source::event::{Event, Frame, Truth};
 use crate::source::topics::TruthKind;
-use crate::source::Rig;
 use crate::sync::{DropCounts, Synchronizer};
 use crate::window::{PosedSet, Window, WindowBuilder};
 

@@ -52,7 +52,9 @@ pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
     let rig = source.rig();
     let engine = Engine::new(model, &config.model, rig.cameras.len(), config.window.timespan_sec)?;
     if engine.weights() == UNTRAINED {
-        warn!("weights: untrained. Seeded random weights stand in; the results show the plumbing, not a reconstruction");
+        warn!(
+            "weights: untrained. Seeded random weights stand in; the results show the plumbing, not a reconstruction"
+        );
     }
     describe(&source, &rig, &engine, size);
     std::fs::create_dir_all(&options.out)

@@ -93,7 +93,13 @@ impl StepMaker {
     /// What is left at the end: the map, all trajectories, the stage times, and windows dropped as not finite.
     pub fn finish(mut self) -> Finished {
         let tracks = self.tracker.finish();
-        Finished { map: self.map, tracks, timings: self.timings, steps: self.steps, non_finite_windows: self.non_finite }
+        Finished {
+            map: self.map,
+            tracks,
+            timings: self.timings,
+            steps: self.steps,
+            non_finite_windows: self.non_finite,
+        }
     }
 }
 

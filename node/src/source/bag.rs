@@ -49,10 +49,17 @@ impl BagSource {
         if bag.message_count() == 0 {
             anyhow::bail!("bag {} holds no messages", path.display());
         }
-        let plan = TopicPlan::resolve(bag.topics(), &config.input).with_context(|| format!("bag {}", path.display()))?;
+        let plan =
+            TopicPlan::resolve(bag.topics(), &config.input).with_context(|| format!("bag {}", path.display()))?;
         let (described, pose_child, static_transforms) = describe(&bag, &plan)?;
-        let rig = Rig::build(described, &static_tree(&config.sync, &static_transforms), &pose_child, &config.input, network_size)
-            .with_context(|| format!("bag {}", path.display()))?;
+        let rig = Rig::build(
+            described,
+            &static_tree(&config.sync, &static_transforms),
+            &pose_child,
+            &config.input,
+            network_size,
+        )
+        .with_context(|| format!("bag {}", path.display()))?;
         let mut roles = vec![Role::None; bag.topics().len()];
         for (camera, c) in plan.cameras.iter().enumerate() {
             roles[c.image] = Role::Image { camera, compressed: c.compressed };
@@ -99,8 +106,7 @@ impl BagSource {
 
     /// Runs through the bag once, in log-time order. `each` returns false to stop early.
     pub fn events(&self, mut each: impl FnMut(Event) -> bool) -> Result<()> {
-        let wanted: Vec<usize> =
-            (0..self.roles.len()).filter(|&i| !matches!(self.roles[i], Role::None)).collect();
+        let wanted: Vec<usize> = (0..self.roles.len()).filter(|&i| !matches!(self.roles[i], Role::None)).collect();
         let mut losses = vec![0usize; self.roles.len()];
         for message in self.bag.messages(&wanted)? {
             let message = match message {

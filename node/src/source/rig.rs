@@ -17,7 +17,9 @@ pub const DEFAULT_BASE_FRAME: &str = "base_link";
 #[derive(Debug, Error)]
 pub enum RigError {
     /// A camera gave no CameraInfo.
-    #[error("camera {camera} ({topic}): no message on its camera_info topic {info_topic}; without intrinsics it cannot be used")]
+    #[error(
+        "camera {camera} ({topic}): no message on its camera_info topic {info_topic}; without intrinsics it cannot be used"
+    )]
     NoInfo {
         /// Camera index.
         camera: usize,
@@ -142,10 +144,15 @@ impl Rig {
             let Some(info) = info else { return Err(RigError::NoInfo { camera, topic, info_topic }) };
             let Some(frame_id) = frame_id else { return Err(RigError::NoImage { camera, topic }) };
             let rectified = is_rectified(&topic, &config.rectified);
-            let rectifier = Rectifier::new(&info, rectified, width, height)
-                .map_err(|source| RigError::Info { camera, topic: topic.clone(), source })?;
+            let rectifier = Rectifier::new(&info, rectified, width, height).map_err(|source| RigError::Info {
+                camera,
+                topic: topic.clone(),
+                source,
+            })?;
             let mount = match config.base_from_camera.get(camera) {
-                Some(m) => extrinsics::base_from_camera(m).map_err(|e| no_mount(camera, &base_frame, "", e.to_string()))?,
+                Some(m) => {
+                    extrinsics::base_from_camera(m).map_err(|e| no_mount(camera, &base_frame, "", e.to_string()))?
+                }
                 None => {
                     let frame = if frame_id.is_empty() { info.header.frame_id.clone() } else { frame_id.clone() };
                     mount_from_tree(tree, camera, &base_frame, &frame)?
@@ -153,9 +160,7 @@ impl Rig {
             };
             // On raw images the rectifier turns the camera; the mounting follows it.
             let base_from_camera = match rectifier.rectification() {
-                Some(rectified_from_camera) => {
-                    mount * Rigid::new(rectified_from_camera, glam::DVec3::ZERO).inverse()
-                }
+                Some(rectified_from_camera) => mount * Rigid::new(rectified_from_camera, glam::DVec3::ZERO).inverse(),
                 None => mount,
             };
             let intrinsics = rectifier.intrinsics();

@@ -21,7 +21,7 @@ pub fn posed_set(drive: &Drive, frame: usize) -> (PosedSet<Frame>, Vec<WorldFram
         let rgb = RgbPicture { width: picture.width, height: picture.height, data: picture.rgb.clone() };
         frames.push(PosedFrame {
             stamp_ns: (time_sec * 1e9).round() as i64,
-            map_from_camera: rigid(&(drive.map_from_base(time_sec) * c.base_from_camera)),
+            map_from_camera: Rigid::from(&(drive.map_from_base(time_sec) * c.base_from_camera)),
             item: Frame { rgb: Arc::new(rgb) },
         });
         truth.push(picture);
@@ -34,9 +34,4 @@ pub fn posed_set(drive: &Drive, frame: usize) -> (PosedSet<Frame>, Vec<WorldFram
 pub fn first_window(drive: &Drive, config: &WindowConfig, reference: usize) -> Option<Window<Frame>> {
     let mut builder = WindowBuilder::new(config, reference);
     (0..drive.frame_count()).find_map(|i| builder.push(posed_set(drive, i).0))
-}
-
-/// A rigid transform from its matrix form.
-pub fn rigid(t: &glam::DAffine3) -> Rigid {
-    Rigid::new(glam::DQuat::from_mat3(&t.matrix3).normalize(), t.translation)
 }

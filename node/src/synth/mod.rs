@@ -18,7 +18,6 @@ mod truth;
 
 use std::path::Path;
 
-use glam::{DAffine3, DQuat};
 use storm_render::Intrinsics;
 use storm_render::world::{Drive, WorldFrame};
 use thiserror::Error;
@@ -104,31 +103,6 @@ pub fn camera_frame(i: usize) -> String {
     format!("camera{i}_optical")
 }
 
-/// A rigid glam transform as ours.
-fn rigid(t: &DAffine3) -> Rigid {
-    Rigid::new(DQuat::from_mat3(&t.matrix3).normalize(), t.translation)
-}
-
-/// Intrinsics as ROS states them.
-///
-/// ROS follows OpenCV, where the centre of the first pixel is 0.0; ours puts it at 0.5, so the principal point moves by
-/// half a pixel.
-pub fn camera_info(intrinsics: &Intrinsics, header: Header) -> CameraInfo {
-    let (fx, fy) = (f64::from(intrinsics.fx), f64::from(intrinsics.fy));
-    let (cx, cy) = (f64::from(intrinsics.cx) - 0.5, f64::from(intrinsics.cy) - 0.5);
-    CameraInfo {
-        header,
-        height: intrinsics.height as u32,
-        width: intrinsics.width as u32,
-        distortion_model: "plumb_bob".into(),
-        d: vec![0.0; 5],
-        k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-        ..CameraInfo::default()
-    }
-}
-
 /// One picture as the message the options ask for.
 fn encode_picture(
     coding: ImageCoding,
@@ -182,7 +156,7 @@ fn static_transforms(drive: &Drive, stamp_ns: i64) -> Vec<TransformStamped> {
         .map(|(i, camera)| TransformStamped {
             header: Header { stamp_ns, frame_id: BASE_FRAME.into() },
             child_frame_id: camera_frame(i),
-            transform: rigid(&camera.base_from_camera),
+            transform: Rigid::from(&camera.base_from_camera),
         })
         .collect()
 }
@@ -197,7 +171,7 @@ fn write_picture(
     coding: ImageCoding,
 ) -> Result<(), SynthError> {
     let stamp_ns = header.stamp_ns;
-    bag.write(topics.info, stamp_ns, &encode_camera_info(&camera_info(intrinsics, header.clone()))?)?;
+    bag.write(topics.info, stamp_ns, &encode_camera_info(&CameraInfo::pinhole(intrinsics, header.clone()))?)?;
     if let Some(truth) = &topics.truth {
         truth.write(bag, &header, &frame)?;
     }
@@ -237,7 +211,7 @@ pub fn write_drive(
         match *event {
             Event::Pose { stamp_ns, time_sec } => {
                 let header = Header { stamp_ns, frame_id: MAP_FRAME.into() };
-                let pose = rigid(&drive.map_from_base(time_sec));
+                let pose = Rigid::from(&drive.map_from_base(time_sec));
                 let message = PoseStamped { header, child_frame_id: BASE_FRAME.into(), pose };
                 bag.write(odometry, stamp_ns, &encode_odometry(&message)?)?;
             }

@@ -14,8 +14,8 @@ use crate::output::picture::{
     with_flow_wheel,
 };
 use crate::output::report::{
-    ErrorRow, ErrorTable, Panel, Report, ReportCamera, ReportFile, ReportStep, ReportTrack, StageTiming, TopViewSection,
-    WeightsState,
+    ErrorRow, ErrorTable, Panel, Report, ReportCamera, ReportFile, ReportStep, ReportTrack, StageTiming,
+    TopViewSection, WeightsState,
 };
 use crate::output::tracks_csv::TrackRow;
 use crate::pipeline::metrics::Metrics;
@@ -184,8 +184,16 @@ fn report_step(step: &Step, rig: &Rig) -> Result<ReportStep> {
             panels: vec![
                 panel("input", format!("{} ns", newest.frames[c].stamp_ns), input),
                 panel("rendered", "the newest picture as the scene shows it".into(), rendered.clone()),
-                panel("depth", "z-depth, m, logarithmic".into(), with_depth_bar(&depth_picture(w, h, &depths[c], scale)?, scale)),
-                panel("flow", "m/s; hue is direction in the ground plane".into(), with_flow_wheel(&flow, FULL_SPEED_MPS)),
+                panel(
+                    "depth",
+                    "z-depth, m, logarithmic".into(),
+                    with_depth_bar(&depth_picture(w, h, &depths[c], scale)?, scale),
+                ),
+                panel(
+                    "flow",
+                    "m/s; hue is direction in the ground plane".into(),
+                    with_flow_wheel(&flow, FULL_SPEED_MPS),
+                ),
                 panel("mask", "moving pixels by motion group".into(), mask_overlay(&rendered, &mask)?),
             ],
         });
@@ -210,8 +218,17 @@ fn top_view(run: &Run) -> TopViewSection {
             color: palette((rows[0].track_id % 64) as u16 + 1),
         })
         .collect();
-    let caption = format!("{} map Gaussians from above, x to the right, y up; the vehicle's way; trajectories of moving points", run.map.len());
-    TopViewSection { view, picture: top_view_picture(&view, &points, &colors, run.config.map.voxel_m), tracks, trajectory, caption }
+    let caption = format!(
+        "{} map Gaussians from above, x to the right, y up; the vehicle's way; trajectories of moving points",
+        run.map.len()
+    );
+    TopViewSection {
+        view,
+        picture: top_view_picture(&view, &points, &colors, run.config.map.voxel_m),
+        tracks,
+        trajectory,
+        caption,
+    }
 }
 
 fn files(report: &Path) -> Vec<ReportFile> {

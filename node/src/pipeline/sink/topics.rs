@@ -5,16 +5,15 @@ use std::path::Path;
 use anyhow::Result;
 use glam::{DVec3, Vec3};
 use storm_model::scene::{Affine, RenderedView};
-use storm_render::Intrinsics;
 
 use crate::cdr::encode;
 use crate::cdr::schema::MessageType;
 use crate::config::Config;
 use crate::engine::select;
+use crate::map::color01;
 use crate::msg::{CameraInfo, Header, Image, PointCloud2, PoseStamped, TransformStamped};
 use crate::output::bag_writer::{BagWriter, TopicId};
 use crate::output::cloud::{FlowCloud, GaussianCloud, MapCloud, NO_TRACK, flow_cloud, gaussian_cloud, map_cloud};
-use crate::map::color01;
 use crate::output::picture::{Picture, mask_overlay};
 use crate::output::ply::PlyCloud;
 use crate::output::qos::Qos;
@@ -139,7 +138,13 @@ impl Publisher {
         let velocities = &g.velocity_forward[range.clone()];
         // A pixel that its own Gaussian hardly covers shows the sky.
         let valid: Vec<bool> = g.opacities[range].iter().map(|&o| o >= select::SURFACE_OPACITY).collect();
-        let cloud = FlowCloud { width: shape.width, height: shape.cameras * shape.height, positions, velocities, valid: &valid };
+        let cloud = FlowCloud {
+            width: shape.width,
+            height: shape.cameras * shape.height,
+            positions,
+            velocities,
+            valid: &valid,
+        };
         let built = flow_cloud(header, &cloud)?;
         self.non_finite += built.non_finite as u64;
         Ok(built.cloud)
@@ -171,7 +176,10 @@ impl Publisher {
             (topics.depth, encode::encode_image(&image("32FC1", 4, depth))?),
             (topics.mask, encode::encode_image(&image("mono8", 1, mask))?),
             (topics.mask_color, encode::encode_image(&image("rgb8", 3, over))?),
-            (topics.info, encode::encode_camera_info(&camera_info(header.clone(), &rig.cameras[camera].intrinsics))?),
+            (
+                topics.info,
+                encode::encode_camera_info(&CameraInfo::pinhole(&rig.cameras[camera].intrinsics, header.clone()))?,
+            ),
         ];
         for (topic, cdr) in messages {
             self.bag.write(topic, step.window.stamp_ns, &cdr)?;
@@ -230,21 +238,4 @@ pub fn motion_mask(view: &RenderedView) -> Vec<u8> {
     let moves = |p: usize| view.flow.as_ref().is_some_and(|f| Vec3::from(f[p]).length() >= select::MOVING_MPS);
     let group = |p: usize| view.motion_id.as_ref().map_or(0, |m| m[p]);
     (0..pixels).map(|p| if moves(p) { (group(p) + 1).min(255) as u8 } else { 0 }).collect()
-}
-
-/// CameraInfo of an undistorted picture. ROS puts the centre of the first pixel at 0, we at 0.5.
-fn camera_info(header: Header, k: &Intrinsics) -> CameraInfo {
-    let (fx, fy) = (k.fx as f64, k.fy as f64);
-    let (cx, cy) = (k.cx as f64 - 0.5, k.cy as f64 - 0.5);
-    CameraInfo {
-        header,
-        height: k.height as u32,
-        width: k.width as u32,
-        distortion_model: "plumb_bob".into(),
-        d: vec![0.0; 5],
-        k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-        ..CameraInfo::default()
-    }
 }
