@@ -1,7 +1,8 @@
 //! Milliseconds to render the load of one step: 460,800 pixel-aligned Gaussians (12 images of 160x240: three cameras at
 //! four times along a straight drive) into three 160x240 views.
 //!
-//! `cargo run --release -p storm-render --example raster_speed [repeats]`
+//! `cargo run --release -p storm-render --example raster_speed [repeats] [yaw_deg]`; `yaw_deg` is the angle between
+//! neighbouring cameras: at 50 (the default) each sees its own third of the Gaussians, at 0 all see all of them.
 
 use glam::{Affine3A, Mat3, Quat, Vec3};
 use rand::{RngExt, SeedableRng};
@@ -15,10 +16,10 @@ const HEIGHT: usize = 160;
 /// Standard deviation of a Gaussian in the picture it was made from, pixels.
 const SIGMA_PX: f32 = 0.5;
 
-/// Three cameras, 50 degrees apart, at `forward` metres along x (x forward, y left, z up).
-fn rig(forward: f32) -> [View; 3] {
+/// Three cameras, `yaw_deg` apart, at `forward` metres along x (x forward, y left, z up).
+fn rig(forward: f32, yaw_deg: f32) -> [View; 3] {
     let base_from_camera = Mat3::from_cols(Vec3::NEG_Y, Vec3::NEG_Z, Vec3::X);
-    [50.0f32, 0.0, -50.0].map(|yaw_deg| {
+    [yaw_deg, 0.0, -yaw_deg].map(|yaw_deg| {
         let rotation = Mat3::from_quat(Quat::from_rotation_z(yaw_deg.to_radians())) * base_from_camera;
         let pose = Affine3A::from_mat3_translation(rotation, Vec3::new(forward, 0.0, 1.5));
         View::from_pose(pose, Intrinsics::from_fov(55.0, WIDTH, HEIGHT))
@@ -33,10 +34,10 @@ struct Scene {
 }
 
 /// One Gaussian per pixel; depths vary smoothly over the picture (surfaces) with a few per cent of noise.
-fn scene(rng: &mut ChaCha8Rng) -> Scene {
+fn scene(rng: &mut ChaCha8Rng, yaw_deg: f32) -> Scene {
     let mut s = Scene { means: vec![], quats: vec![], scales: vec![], opacities: vec![] };
     for step in 0..4 {
-        for view in rig(step as f32 * 5.0) {
+        for view in rig(step as f32 * 5.0, yaw_deg) {
             let camera = view.intrinsics;
             let pose = view.world_from_camera();
             let phase: [f32; 3] = std::array::from_fn(|_| rng.random_range(0.0..6.3));
@@ -71,9 +72,10 @@ fn cpu_ms() -> Option<f64> {
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let repeats: usize = std::env::args().nth(1).map_or(Ok(15), |a| a.parse())?;
+    let yaw_deg: f32 = std::env::args().nth(2).map_or(Ok(50.0), |a| a.parse())?;
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let scene = scene(&mut rng);
-    let views = rig(11.0);
+    let scene = scene(&mut rng, yaw_deg);
+    let views = rig(11.0, yaw_deg);
     println!("{} Gaussians, 3 views of {WIDTH}x{HEIGHT}, {} threads", scene.means.len(), rayon::current_num_threads());
     for channels in [3, 6, 22] {
         let features: Vec<f32> = (0..scene.means.len() * channels).map(|_| rng.random_range(-1.0..1.0)).collect();
