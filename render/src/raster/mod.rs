@@ -18,7 +18,7 @@ mod tiles;
 mod tests;
 
 pub use error::RasterError;
-pub use scene::{MAX_PICTURE_VALUES, MAX_SIDE, MAX_SPLATS, MAX_VIEWS, Picture, RasterStats, Splats};
+pub use scene::{MAX_FEATURES, MAX_PICTURE_VALUES, MAX_SIDE, MAX_SPLATS, MAX_VIEWS, Picture, RasterStats, Splats};
 pub use settings::{ALPHA_MIN, Convention, RasterSettings, TILE_RULE, TRANSMITTANCE_STOP};
 
 use crate::camera::View;

@@ -9,6 +9,8 @@ pub const MAX_SIDE: usize = 1 << 15;
 pub const MAX_PICTURE_VALUES: usize = 1 << 30;
 /// Most Gaussians of one call: their indices are kept in 32 bits.
 pub const MAX_SPLATS: usize = 1 << 31;
+/// Most channels per Gaussian: every thread holds a tile of them (10 MiB at most).
+pub const MAX_FEATURES: usize = 1 << 12;
 /// Most views of one call.
 pub const MAX_VIEWS: usize = 1 << 10;
 /// How far `R^T R` of a camera pose may be from identity: f32 rotations chained over a drive drift by about 1e-5.
@@ -48,13 +50,16 @@ impl Splats<'_> {
         if n > MAX_SPLATS {
             return Err(RasterError::TooMany { name: "Gaussians", value: n, limit: MAX_SPLATS });
         }
+        if self.feature_count > MAX_FEATURES {
+            return Err(RasterError::TooMany { name: "channels", value: self.feature_count, limit: MAX_FEATURES });
+        }
         let check = |name, len, expected| {
             (len == expected).then_some(()).ok_or(RasterError::Length { name, len, expected, splats: n })
         };
         check("quats", self.quats.len(), n)?;
         check("scales", self.scales.len(), n)?;
         check("opacities", self.opacities.len(), n)?;
-        check("features", self.features.len(), n.checked_mul(self.feature_count).unwrap_or(usize::MAX))
+        check("features", self.features.len(), n.saturating_mul(self.feature_count))
     }
 
     /// Features of Gaussian `i`; empty when there are none.
@@ -131,7 +136,7 @@ pub(crate) fn validate_views(views: &[View], feature_count: usize) -> Result<(),
         if width > MAX_SIDE || height > MAX_SIDE {
             return refuse(format!("{width}x{height} pixels; no side may exceed {MAX_SIDE}"));
         }
-        let values = (width * height).checked_mul(feature_count.max(1)).unwrap_or(usize::MAX);
+        let values = (width * height).saturating_mul(feature_count.max(1));
         if values > MAX_PICTURE_VALUES {
             return refuse(format!(
                 "{width}x{height}x{feature_count} values; at most {MAX_PICTURE_VALUES} fit a picture"
