@@ -7,7 +7,7 @@ use super::stages::Stages;
 use super::upsample::{Upsampler, unnest};
 use crate::config::{MaskDecoder, ModelConfig, VelocityKind};
 use crate::error::ModelError;
-use crate::ops::softmax;
+use crate::ops::{Activation, Linear, linear, softmax};
 
 /// Velocities of every pixel and how they came about.
 pub(crate) struct Motion {
@@ -33,6 +33,11 @@ pub(crate) struct MotionHead {
 
 /// The picture whose pixel-wise stages are kept for comparison: timestep 0, camera 1 (camera 0 of one-camera windows).
 const PROBED_PICTURE: usize = 1;
+
+/// Dot products of every row of `x` with every row of `rows`.
+fn product(x: &Tensor, rows: Tensor) -> candle_core::Result<Tensor> {
+    linear(x, &Linear::new(rows, None), Activation::None, None)
+}
 
 impl MotionHead {
     pub fn new(config: &ModelConfig, params: &Params<'_>) -> Result<Self, ModelError> {
@@ -84,9 +89,9 @@ impl MotionHead {
             let velocity = match &mixture {
                 Some((queries, bases)) => {
                     let window = picture / (t * v);
-                    let logits = keys.matmul(&queries.get(window)?.t()?)?;
+                    let logits = product(&keys, queries.get(window)?)?;
                     let weights = softmax(&logits, config.tau)?;
-                    let velocity = weights.matmul(&bases.get(window)?)?;
+                    let velocity = product(&weights, bases.get(window)?.t()?.contiguous()?)?;
                     all_weights.push(unnest(&weights, grid, levels)?);
                     velocity
                 }

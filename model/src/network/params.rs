@@ -3,7 +3,7 @@
 use candle_core::Tensor;
 
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, layer_norm, linear};
+use crate::ops::{Activation, Linear, layer_norm, linear, mlp};
 use crate::weights::{Tensors, WeightsError};
 
 /// Epsilon of every layer norm.
@@ -78,6 +78,9 @@ pub(crate) struct Mlp(Vec<Linear>);
 
 impl Mlp {
     pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
+        if let [first, second] = &self.0[..] {
+            return mlp(x, first, Activation::Gelu, second, None);
+        }
         let mut x = x.clone();
         for (k, layer) in self.0.iter().enumerate() {
             let act = if k + 1 < self.0.len() { Activation::Gelu } else { Activation::None };

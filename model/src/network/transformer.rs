@@ -6,7 +6,7 @@ use super::params::{Norm, Params};
 use super::stages::Stages;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, attention, linear};
+use crate::ops::{Activation, Linear, attention, linear, mlp};
 
 #[derive(Debug, Clone)]
 struct Block {
@@ -74,8 +74,7 @@ impl Block {
         probe("attn", &attended - x)?;
         let y = self.norm2.forward(&attended)?;
         probe("norm2", Ok(y.clone()))?;
-        let hidden = linear(&y, &self.fc1, Activation::Gelu, None)?;
-        let out = linear(&hidden, &self.fc2, Activation::None, Some(&attended))?;
+        let out = mlp(&y, &self.fc1, Activation::Gelu, &self.fc2, Some(&attended))?;
         probe("mlp", &out - &attended)?;
         Ok(out)
     }
