@@ -1,8 +1,8 @@
 //! Recorded bags: MCAP and rosbag2 sqlite3, one file or a folder.
 //!
-//! [`Bag::open`] finds the files ([`locate`], [`metadata`]), unpacks `.zstd` ones, and indexes each by its storage
-//! ([`mcap`], [`sqlite`]); [`Bag::messages`] merges them into one stream in log-time order ([`merge`]). Whatever is damaged
-//! but did not stop us becomes a line of [`Bag::problems`]. Nothing is ever written beside a bag.
+//! [`Bag::open`] finds the files (`locate`, `metadata`), unpacks `.zstd` ones, and indexes each by its storage (`mcap`,
+//! `sqlite`); [`Bag::messages`] merges them into one stream in log-time order (`merge`). Whatever is damaged but did not
+//! stop us becomes a line of [`Bag::problems`]. Nothing is ever written beside a bag.
 
 mod error;
 mod limits;

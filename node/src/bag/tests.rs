@@ -125,6 +125,18 @@ fn splits_merge_across_files_and_a_missing_one_is_named() {
 }
 
 #[test]
+fn reading_can_move_to_a_thread() {
+    fn can_move<T: Send + 'static>(_: &T) {}
+    let dir = tempfile::tempdir().unwrap();
+    database(&dir.path().join("b.db3"), Schema::New, 0, 4, false);
+    let bag = Bag::open(dir.path()).unwrap();
+    let messages = bag.messages(&[0]).unwrap();
+    can_move(&messages);
+    drop(bag);
+    assert_eq!(std::thread::spawn(move || messages.count()).join().unwrap(), 2);
+}
+
+#[test]
 fn ties_between_files_come_in_file_order() {
     let dir = tempfile::tempdir().unwrap();
     for name in ["b_0.db3", "b_1.db3"] {

@@ -229,7 +229,7 @@ mod tests {
             Self { bytes: vec![0, u8::from(!big), 0, 0], big }
         }
         fn raw(mut self, size: usize, le: &[u8]) -> Self {
-            while (self.bytes.len() - 4) % size != 0 {
+            while !(self.bytes.len() - 4).is_multiple_of(size) {
                 self.bytes.push(0);
             }
             let mut b = le.to_vec();

@@ -47,36 +47,54 @@ fn bilinear(at: f64, end: f64) -> (usize, Vec<f32>) {
     }
 }
 
+/// Source bytes from which several threads pay: a megapixel takes one about a millisecond.
+const PARALLEL_FROM_BYTES: usize = 8 << 20;
+
 /// Resamples along both axes. `rows` and `cols` must have been made for the picture's size.
 pub fn resample(picture: &RgbPicture, cols: &AxisWeights, rows: &AxisWeights) -> RgbPicture {
     let (width, height) = (cols.0.len(), rows.0.len());
     let stride = picture.width * 3;
     let mut data = vec![0u8; width * height * 3];
-    data.par_chunks_mut(width * 3).zip(&rows.0).for_each_init(
-        || vec![0.0f32; stride],
-        |sums, (out, (first, weights))| {
-            // Down the columns first: whole rows at a time.
-            sums.fill(0.0);
-            for (row, weight) in picture.data.chunks_exact(stride).skip(*first).zip(weights) {
-                for (sum, v) in sums.iter_mut().zip(row) {
-                    *sum += weight * f32::from(*v);
-                }
-            }
-            let (sums, _) = sums.as_chunks::<3>();
-            let (pixels, _) = out.as_chunks_mut::<3>();
-            for (pixel, (first, weights)) in pixels.iter_mut().zip(&cols.0) {
-                let mut rgb = [0.5f32; 3];
-                for (sum, weight) in sums.iter().skip(*first).zip(weights) {
-                    for (a, s) in rgb.iter_mut().zip(sum) {
-                        *a += weight * s;
-                    }
-                }
-                // `as` saturates; the half added above rounds.
-                *pixel = rgb.map(|v| v as u8);
-            }
-        },
-    );
+    let sums = || vec![0.0f32; stride];
+    if picture.data.len() >= PARALLEL_FROM_BYTES {
+        data.par_chunks_mut(width * 3)
+            .zip(&rows.0)
+            .for_each_init(sums, |sums, (out, row)| resample_row(picture, cols, row, sums, out));
+    } else {
+        let mut sums = sums();
+        for (out, row) in data.chunks_mut(width * 3).zip(&rows.0) {
+            resample_row(picture, cols, row, &mut sums, out);
+        }
+    }
     RgbPicture { width, height, data }
+}
+
+/// One output row: down the columns first, whole source rows at a time, then along the row.
+fn resample_row(
+    picture: &RgbPicture,
+    cols: &AxisWeights,
+    (first, weights): &(usize, Vec<f32>),
+    sums: &mut [f32],
+    out: &mut [u8],
+) {
+    sums.fill(0.0);
+    for (row, weight) in picture.data.chunks_exact(sums.len()).skip(*first).zip(weights) {
+        for (sum, v) in sums.iter_mut().zip(row) {
+            *sum += weight * f32::from(*v);
+        }
+    }
+    let (sums, _) = sums.as_chunks::<3>();
+    let (pixels, _) = out.as_chunks_mut::<3>();
+    for (pixel, (first, weights)) in pixels.iter_mut().zip(&cols.0) {
+        let mut rgb = [0.5f32; 3];
+        for (sum, weight) in sums.iter().skip(*first).zip(weights) {
+            for (a, s) in rgb.iter_mut().zip(sum) {
+                *a += weight * s;
+            }
+        }
+        // `as` saturates; the half added above rounds.
+        *pixel = rgb.map(|v| v as u8);
+    }
 }
 
 #[cfg(test)]
@@ -123,6 +141,22 @@ mod tests {
             for (g, want) in got.data.iter().zip(reference(&p, ow, oh, (sx, tx), (sy, ty))) {
                 prop_assert!((f64::from(*g) - want).abs() <= BYTE_TOLERANCE, "{g} {want}");
             }
+        }
+    }
+
+    #[test]
+    fn threads_do_not_change_a_byte() {
+        let (w, h) = (2400, 1200);
+        let data: Vec<u8> = (0..w * h * 3).map(|i| ((i as u32).wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+        assert!(data.len() >= PARALLEL_FROM_BYTES);
+        let p = RgbPicture { width: w, height: h, data };
+        let (cols, rows) = (AxisWeights::new(50, w, 47.9, 1.3), AxisWeights::new(40, h, 29.7, -3.0));
+        let many = resample(&p, &cols, &rows);
+        let mut sums = vec![0.0; w * 3];
+        for (out, row) in many.data.chunks(150).zip(&rows.0) {
+            let mut alone = vec![0; 150];
+            resample_row(&p, &cols, row, &mut sums, &mut alone);
+            assert_eq!(out, alone);
         }
     }
 

@@ -267,11 +267,7 @@ impl<'a> Walk<'a> {
         let mut first = Ok(());
         let mut start_ns = i64::MAX;
         for_each_record(&content.records, |opcode, _, body| match opcode {
-            op::SCHEMA | op::CHANNEL => {
-                if first.is_ok() {
-                    first = self.small_record(opcode, body);
-                }
-            }
+            op::SCHEMA | op::CHANNEL if first.is_ok() => first = self.small_record(opcode, body),
             op::MESSAGE => {
                 if let Some(m) = MessageHead::parse(body) {
                     *counts.entry(m.channel).or_default() += 1;

@@ -135,7 +135,7 @@ fn cut_files_give_what_comes_before_the_cut() {
         let mut last = 0;
         // A prime stride visits all kinds of places; the last bytes hold the summary and the footer.
         let tail = whole.len() - 60;
-        for cut in (8..tail).step_by(37).chain(tail..whole.len()) {
+        for cut in (8..tail).step_by(83).chain(tail..whole.len()) {
             // A new file each time: writing over one makes some file systems wait for the disk.
             let path = dir.path().join(format!("{form}_{cut}.mcap"));
             std::fs::write(&path, &whole[..cut]).unwrap();
