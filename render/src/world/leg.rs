@@ -1,0 +1,76 @@
+//! Everything that belongs to one leg, made when the ego comes near and dropped when it has passed.
+
+use super::buildings;
+use super::layout::Layout;
+use super::site::{Site, StaticBody};
+use super::street;
+use super::traffic::{Convoy, Flow, leg_flows};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// A leg's content.
+#[derive(Debug)]
+pub(crate) struct LegContent {
+    pub bodies: Vec<StaticBody>,
+    pub flows: Vec<Flow>,
+    /// Which slots of which stream may exist, as far as anybody asked.
+    known: Mutex<HashMap<(u32, i64), bool>>,
+}
+
+impl LegContent {
+    fn new(layout: &Layout, index: usize) -> Self {
+        let mut site = Site::new(layout, index);
+        let mut parked = 0;
+        if let Some(leg) = layout.legs.get(index) {
+            for road in &layout.roads[leg.road..leg.roads_end] {
+                buildings::line_road(&mut site, road);
+            }
+            for road in &layout.roads[leg.road..leg.roads_end] {
+                street::furnish(&mut site, road, &mut parked);
+            }
+            for road in &layout.roads[leg.road..leg.roads_end] {
+                buildings::backdrop(&mut site, layout, road);
+            }
+        }
+        Self { bodies: site.bodies, flows: leg_flows(layout, index), known: Mutex::default() }
+    }
+
+    pub(crate) fn exists(&self, flow: usize, slot: i64, convoy: &Convoy, seconds: f64) -> bool {
+        let key = (flow as u32, slot);
+        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = known.get(&key) {
+            return *found;
+        }
+        let exists = self.flows.get(flow).is_some_and(|f| f.exists(slot, &self.flows, convoy, seconds));
+        known.insert(key, exists);
+        exists
+    }
+}
+
+/// Most legs kept at once; a view needs five.
+const KEEP: usize = 24;
+
+/// The legs made so far. What a leg holds follows from the layout alone, so it makes no difference who made it when.
+#[derive(Debug, Default)]
+pub(crate) struct LegStore(Mutex<HashMap<usize, Arc<LegContent>>>);
+
+impl LegStore {
+    pub(crate) fn get(&self, layout: &Layout, index: usize) -> Arc<LegContent> {
+        let find = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(leg) = find().get(&index) {
+            return leg.clone();
+        }
+        let made = Arc::new(LegContent::new(layout, index));
+        let mut legs = find();
+        if legs.len() >= KEEP {
+            // Keep the nearest half: a replay moves on along the route.
+            let mut far: Vec<usize> = legs.keys().copied().collect();
+            far.sort_by_key(|i| i.abs_diff(index));
+            far.drain(..KEEP / 2);
+            far.iter().for_each(|i| {
+                legs.remove(i);
+            });
+        }
+        legs.entry(index).or_insert(made).clone()
+    }
+}
