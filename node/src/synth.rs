@@ -1,1 +1,0 @@
-//! A procedural drive written as a bag, ground truth included.
