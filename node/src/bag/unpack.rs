@@ -160,7 +160,7 @@ mod tests {
     fn files_are_told_apart_by_their_first_bytes() {
         let d = tempfile::tempdir().unwrap();
         let f = d.path().join("f");
-        let mut say = |bytes: &[u8]| {
+        let say = |bytes: &[u8]| {
             std::fs::write(&f, bytes).unwrap();
             sniff(&f).map_err(|e| e.to_string())
         };

@@ -1,1 +1,44 @@
 //! Camera messages to pictures: raw encodings, compressed files, rectification.
+//!
+//! [`image_to_rgb`] and [`compressed_to_rgb`] give 8-bit RGB, [`Rectifier`] takes it to the network's size and removes the
+//! lens. [`image_to_depth`], [`image_to_vectors`] and [`image_to_labels`] read ground truth.
+
+mod bayer;
+mod color;
+mod compressed;
+mod error;
+mod lens;
+mod measure;
+mod rectify;
+mod resample;
+mod rows;
+mod warp;
+
+pub use color::image_to_rgb;
+pub use compressed::compressed_to_rgb;
+pub use error::DecodeError;
+pub use lens::Lens;
+pub use measure::{image_to_depth, image_to_labels, image_to_vectors};
+pub use rectify::Rectifier;
+
+/// An 8-bit RGB picture, rows from the top.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RgbPicture {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// `height * width * 3` bytes.
+    pub data: Vec<u8>,
+}
+
+/// A depth picture, rows from the top.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DepthPicture {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// `height * width` depths in metres; NaN where there is none.
+    pub data: Vec<f32>,
+}

@@ -28,6 +28,11 @@ pub struct ChunkContent {
     pub problem: Option<String>,
 }
 
+/// The line about messages whose channel is nowhere described: the same at indexing and at reading.
+pub fn undescribed(chunk_offset: u64, messages: u64) -> String {
+    format!("chunk at byte {chunk_offset}: {messages} messages on channels nothing describes: skipped")
+}
+
 /// Reads `len` bytes at `offset`, fewer when the file ends before.
 pub fn read_at(file: &mut File, path: &Path, offset: u64, len: usize) -> Result<Vec<u8>, BagError> {
     file.seek(SeekFrom::Start(offset)).map_err(BagError::io(path))?;
@@ -49,8 +54,13 @@ pub fn load(file: &mut File, path: &Path, file_len: u64, offset: u64) -> Result<
     let Some(head) = ChunkHead::parse(&head) else {
         return Ok(broken(format!("its head is cut off or damaged ({left} bytes follow)")));
     };
-    let there = left.saturating_sub(head.data_offset).min(head.compressed_size);
-    if head.uncompressed_size > MAX_CHUNK_BYTES || there > MAX_CHUNK_BYTES {
+    // Writers put all-ones where the sizes will go; a recorder that dies before leaves them.
+    let never_closed = head.compressed_size == u64::MAX && head.uncompressed_size == u64::MAX;
+    let mut there = left.saturating_sub(head.data_offset).min(head.compressed_size);
+    let mut unpacked_limit = head.uncompressed_size;
+    if never_closed {
+        (there, unpacked_limit) = (there.min(MAX_CHUNK_BYTES), MAX_CHUNK_BYTES);
+    } else if head.uncompressed_size > MAX_CHUNK_BYTES || there > MAX_CHUNK_BYTES {
         let (claimed, packed) = (head.uncompressed_size, head.compressed_size);
         let why = format!("claims {claimed} bytes ({packed} compressed), over the limit of {MAX_CHUNK_BYTES}: skipped");
         return Ok(broken(why));
@@ -61,14 +71,16 @@ pub fn load(file: &mut File, path: &Path, file_len: u64, offset: u64) -> Result<
 
     let (records, mut why) = match head.compression.as_str() {
         "" => (data, None),
-        "zstd" => unpack_zstd(&data, head.uncompressed_size),
+        "zstd" => unpack_zstd(&data, unpacked_limit),
         "lz4" => match lz4::Decoder::new(data.as_slice()) {
-            Ok(d) => read_bounded(d, head.uncompressed_size),
+            Ok(d) => read_bounded(d, unpacked_limit),
             Err(e) => (Vec::new(), Some(e.to_string())),
         },
         other => return Ok(broken(format!("compression `{other}` is not supported (zstd, lz4, none): skipped"))),
     };
-    if cut {
+    if never_closed {
+        why = Some(format!("never closed by its writer; messages in the {there} bytes that follow are read"));
+    } else if cut {
         let packed = head.compressed_size;
         why = Some(format!("the file ends {there} bytes into its {packed}; messages up to there are read"));
     } else if records.len() as u64 != head.uncompressed_size {

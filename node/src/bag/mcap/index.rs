@@ -282,13 +282,15 @@ impl<'a> Walk<'a> {
             _ => {}
         });
         first?;
+        let mut undescribed = 0;
         for (channel, count) in &counts {
             match self.index.topic_of_channel.get(channel) {
                 Some(topic) => self.topics.count(*topic, *count),
-                None => {
-                    self.problem(format!("{count} messages on channel {channel}, which nothing describes: skipped"))
-                }
+                None => undescribed += count,
             }
+        }
+        if undescribed > 0 {
+            self.problem(chunk::undescribed(offset, undescribed));
         }
         if !counts.is_empty() {
             let channels = Some(counts.into_keys().collect());

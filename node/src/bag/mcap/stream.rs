@@ -129,7 +129,7 @@ impl McapStream {
             self.problem(why);
         }
         let mut places = Vec::new();
-        let mut undescribed = 0usize;
+        let mut undescribed = 0u64;
         for_each_record(&content.records, |opcode, body_at, body| {
             if opcode != op::MESSAGE {
                 return;
@@ -143,9 +143,7 @@ impl McapStream {
             places.push(Place { log_time_ns: head.log_time_ns, chunk_offset: offset, start, len, topic });
         });
         if undescribed > 0 {
-            self.problem(&format!(
-                "chunk at byte {offset}: {undescribed} messages on channels nothing describes: skipped"
-            ));
+            self.problem(&chunk::undescribed(offset, undescribed));
         }
         if places.is_empty() {
             return Ok(());

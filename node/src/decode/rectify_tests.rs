@@ -1,0 +1,239 @@
+//! Rectification against pictures whose every ray is known.
+
+use super::*;
+use crate::msg::Header;
+
+const WIDTH: usize = 640;
+const HEIGHT: usize = 400;
+/// How far (output pixels) a rectified picture may sit from where its intrinsics say: 8-bit noise over 10,000 pixels and
+/// the map's 1/256 pixel leave 0.01.
+const SHIFT_TOLERANCE_PX: f64 = 0.01;
+/// Root-mean-square grey levels: rounding twice (0.4) and bilinear sampling of the pattern's curvature.
+const RMS_TOLERANCE: f64 = 1.0;
+
+fn camera(model: &str, d: &[f64]) -> CameraInfo {
+    CameraInfo {
+        header: Header { stamp_ns: 0, frame_id: "cam".to_owned() },
+        width: WIDTH as u32,
+        height: HEIGHT as u32,
+        distortion_model: model.to_owned(),
+        d: d.to_vec(),
+        k: [420.0, 0.0, 325.3, 0.0, 410.0, 196.2, 0.0, 0.0, 1.0],
+        ..CameraInfo::default()
+    }
+}
+
+fn with_p(mut info: CameraInfo, r: DQuat) -> CameraInfo {
+    info.p = [380.0, 0.0, 310.0, 0.0, 0.0, 385.0, 205.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+    info.r = DMat3::from_quat(r).transpose().to_cols_array();
+    info
+}
+
+/// Grey level seen along rectified direction `(x, y, 1)`: periods of 60 pixels and more, so bilinear sampling is exact
+/// to a fraction of a level.
+fn pattern(x: f64, y: f64) -> f64 {
+    128.0 + 55.0 * (30.0 * x + 4.0 * y).sin() + 50.0 * (26.0 * y - 7.0 * x + 1.0).sin()
+}
+
+/// The ray (z = 1) that lands on a point of the normalised plane: Newton steps with a numeric Jacobian.
+fn unproject(lens: &Lens, target: (f64, f64)) -> DVec3 {
+    let at = |x: f64, y: f64| lens.project(DVec3::new(x, y, 1.0)).unwrap();
+    let (mut x, mut y) = target;
+    // Quadratic convergence from the distorted point, which is close.
+    for _ in 0..7 {
+        let (fx, fy) = at(x, y);
+        let h = 1e-6;
+        let (ax, ay) = at(x + h, y);
+        let (bx, by) = at(x, y + h);
+        let (j00, j10, j01, j11) = ((ax - fx) / h, (ay - fy) / h, (bx - fx) / h, (by - fy) / h);
+        let det = j00 * j11 - j01 * j10;
+        let (ex, ey) = (target.0 - fx, target.1 - fy);
+        x += (j11 * ex - j01 * ey) / det;
+        y += (j00 * ey - j10 * ex) / det;
+    }
+    DVec3::new(x, y, 1.0)
+}
+
+/// What the camera sees: pixel (col, row) looks along OpenCV's point (col, row).
+fn photograph(info: &CameraInfo, rectified_from_camera: DQuat) -> RgbPicture {
+    let lens = Lens::from_info(info).unwrap();
+    let mut data = Vec::with_capacity(WIDTH * HEIGHT * 3);
+    for row in 0..HEIGHT {
+        for col in 0..WIDTH {
+            let plane = ((col as f64 - info.k[2]) / info.k[0], (row as f64 - info.k[5]) / info.k[4]);
+            let ray = rectified_from_camera * unproject(&lens, plane);
+            data.extend([pattern(ray.x / ray.z, ray.y / ray.z).round() as u8; 3]);
+        }
+    }
+    RgbPicture { width: WIDTH, height: HEIGHT, data }
+}
+
+/// Offset of the picture from what `intrinsics` promise (output pixels) and the root-mean-square error, over the pixels
+/// that are not black.
+fn misfit(out: &RgbPicture, intrinsics: &Intrinsics) -> (f64, f64, f64) {
+    let k = intrinsics;
+    let mean = |col: f64, row: f64| {
+        let n = 4;
+        let sum: f64 = (0..n * n)
+            .map(|s| {
+                let u = col + (f64::from(s % n) + 0.5) / f64::from(n);
+                let v = row + (f64::from(s / n) + 0.5) / f64::from(n);
+                pattern((u - f64::from(k.cx)) / f64::from(k.fx), (v - f64::from(k.cy)) / f64::from(k.fy))
+            })
+            .sum();
+        sum / f64::from(n * n)
+    };
+    let (mut a, mut b, mut c, mut p, mut q, mut square, mut n) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+    // Away from the border, where the camera may not see the whole pixel.
+    // About 10,000 pixels are plenty.
+    let stride = (out.width / 120).max(1);
+    for row in (3..out.height - 3).step_by(stride) {
+        for col in (3..out.width - 3).step_by(stride) {
+            let around =
+                [-3isize, 0, 3].iter().flat_map(|dr| [-3isize, 0, 3].map(|dc| (row as isize + dr, col as isize + dc)));
+            if around.into_iter().any(|(r, c)| out.data[(r as usize * out.width + c as usize) * 3] == 0) {
+                continue;
+            }
+            let (u, v) = (col as f64, row as f64);
+            let (gx, gy) = (mean(u + 0.5, v) - mean(u - 0.5, v), mean(u, v + 0.5) - mean(u, v - 0.5));
+            let e = f64::from(out.data[(row * out.width + col) * 3]) - mean(u, v);
+            a += gx * gx;
+            b += gx * gy;
+            c += gy * gy;
+            p += gx * e;
+            q += gy * e;
+            square += e * e;
+            n += 1.0;
+        }
+    }
+    assert!(n > 0.3 * (out.width * out.height / (stride * stride)) as f64, "only {n} pixels see anything");
+    let det = a * c - b * b;
+    ((c * p - b * q) / det, (a * q - b * p) / det, (square / n).sqrt())
+}
+
+#[test]
+fn every_model_lands_where_its_intrinsics_say() {
+    let turn = DQuat::from_euler(glam::EulerRot::ZYX, 0.02, -0.05, 0.03);
+    let plumb = [-0.22, 0.06, 0.0011, -0.0013, -0.005];
+    let rational = [0.4, -0.1, 0.001, -0.002, 0.02, 0.62, -0.02, 0.01];
+    let fish = [0.03, -0.01, 0.004, -0.0005];
+    for (name, info, turn) in [
+        ("plumb_bob", camera("plumb_bob", &plumb), DQuat::IDENTITY),
+        ("plumb_bob with P and R", with_p(camera("plumb_bob", &plumb), turn), turn),
+        ("rational", camera("rational_polynomial", &rational), DQuat::IDENTITY),
+        ("equidistant", camera("equidistant", &fish), DQuat::IDENTITY),
+        ("equidistant with P and R", with_p(camera("equidistant", &fish), turn), turn),
+        ("pinhole", camera("plumb_bob", &[0.0; 5]), DQuat::IDENTITY),
+        ("pinhole with P", with_p(camera("", &[]), DQuat::IDENTITY), DQuat::IDENTITY),
+        ("pinhole with P and R", with_p(camera("", &[]), turn), turn),
+    ] {
+        let photo = photograph(&info, turn);
+        for (width, height) in [(160, 100), (96, 64), (333, 201), (700, 450)] {
+            let rectifier = Rectifier::new(&info, false, width, height).unwrap();
+            let out = rectifier.apply(&photo).unwrap();
+            let (dx, dy, rms) = misfit(&out, &rectifier.intrinsics());
+            assert!(dx.abs() < SHIFT_TOLERANCE_PX && dy.abs() < SHIFT_TOLERANCE_PX, "{name} {width}: {dx} {dy} {rms}");
+            assert!(rms < RMS_TOLERANCE, "{name} {width}: {rms}");
+            // The measure is no pushover: an eighth of a pixel is seen as such.
+            let k = rectifier.intrinsics();
+            let (dx, _, _) = misfit(&out, &Intrinsics { cx: k.cx + 0.125, ..k });
+            assert!((dx.abs() - 0.125).abs() < 0.01, "{name} {width}: {dx}");
+            match rectifier.rectification() {
+                Some(q) => assert!(q.dot(turn).abs() > 1.0 - 1e-9 && turn != DQuat::IDENTITY),
+                None => assert_eq!(turn, DQuat::IDENTITY, "{name}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn both_paths_give_the_same_picture() {
+    // A lens too weak to matter takes the general path.
+    let weak = camera("plumb_bob", &[1e-12, 0.0, 0.0, 0.0, 0.0]);
+    let none = camera("plumb_bob", &[0.0; 5]);
+    let photo = photograph(&none, DQuat::IDENTITY);
+    for (width, height) in [(160, 100), (96, 64)] {
+        let general = Rectifier::new(&weak, false, width, height).unwrap();
+        let separable = Rectifier::new(&none, false, width, height).unwrap();
+        assert!(matches!((&general.path, &separable.path), (Path::Warp(_), Path::Separable { .. })));
+        let (a, b) = (general.apply(&photo).unwrap(), separable.apply(&photo).unwrap());
+        assert!(a.data.iter().zip(&b.data).all(|(a, b)| a.abs_diff(*b) <= 2));
+        assert_eq!(general.intrinsics(), separable.intrinsics());
+    }
+}
+
+#[test]
+fn intrinsics_follow_window_binning_and_convention() {
+    let mut info = camera("plumb_bob", &[0.0; 5]);
+    let k = Rectifier::new(&info, false, 320, 100).unwrap().intrinsics();
+    assert_eq!((k.fx, k.fy, k.cx, k.cy), (210.0, 102.5, ((325.3 + 0.5) / 2.0) as f32, ((196.2 + 0.5) / 4.0) as f32));
+    info.roi = [100, 40, 200, 400];
+    info.binning_x = 2;
+    info.binning_y = 4;
+    let r = Rectifier::new(&info, false, 200, 50).unwrap();
+    assert_eq!(r.source_size(), (200, 50));
+    let k = r.intrinsics();
+    assert_eq!((k.fx, k.fy), (210.0, 102.5));
+    assert!(
+        (f64::from(k.cx) - (325.8 - 100.0) / 2.0).abs() < 1e-4 && (f64::from(k.cy) - (196.7 - 40.0) / 4.0).abs() < 1e-4
+    );
+
+    let rectified = with_p(camera("a_model_nobody_knows", &[1.0; 3]), DQuat::from_rotation_x(0.1));
+    let r = Rectifier::new(&rectified, true, WIDTH, HEIGHT).unwrap();
+    assert_eq!((r.intrinsics().fx, r.intrinsics().cy, r.rectification()), (380.0, 205.5, None));
+    let picture = photograph(&camera("", &[]), DQuat::IDENTITY);
+    assert_eq!(r.apply(&picture).unwrap(), picture, "a rectified picture at its own size is copied");
+}
+
+#[test]
+fn cameras_that_are_none_are_refused_with_the_value() {
+    let good = camera("plumb_bob", &[0.0; 5]);
+    let says = |info: &CameraInfo, w: usize, h: usize, text: &str| {
+        let e = Rectifier::new(info, false, w, h).unwrap_err().to_string();
+        assert!(e.contains(text), "{e} should say {text}");
+    };
+    says(&CameraInfo { k: [0.0; 9], ..good.clone() }, 8, 8, "not calibrated");
+    says(&CameraInfo { k: [f64::NAN; 9], ..good.clone() }, 8, 8, "fx NaN");
+    says(&CameraInfo { k: [-5.0, 0.0, 1.0, 0.0, 5.0, 1.0, 0.0, 0.0, 1.0], ..good.clone() }, 8, 8, "fx -5");
+    says(&CameraInfo { width: 0, ..good.clone() }, 8, 8, "size 0x400");
+    says(&CameraInfo { width: u32::MAX, ..good.clone() }, 8, 8, "size 4294967295x400");
+    says(&CameraInfo { roi: [600, 0, 100, 100], ..good.clone() }, 8, 8, "region of interest 100x100 at 600,0");
+    says(&CameraInfo { roi: [u32::MAX, 0, 100, 100], ..good.clone() }, 8, 8, "region of interest");
+    says(&CameraInfo { binning_x: 1000, ..good.clone() }, 8, 8, "binning 1000x1");
+    says(&CameraInfo { distortion_model: "omni".to_owned(), ..good.clone() }, 8, 8, "`omni`");
+    says(&good, 0, 8, "output size 0x8");
+    says(&good, 8, usize::MAX, "output size 8x");
+    let mut bad_r = with_p(good.clone(), DQuat::IDENTITY);
+    bad_r.r[0] = 2.0;
+    says(&bad_r, 8, 8, "R is not a rotation");
+    bad_r.r[0] = f64::NAN;
+    says(&bad_r, 8, 8, "R is not a rotation");
+    let mut skewed = good.clone();
+    skewed.k[1] = 3.0;
+    says(&skewed, 8, 8, "skew 3");
+
+    let r = Rectifier::new(&good, false, 8, 8).unwrap();
+    let e = r.apply(&RgbPicture { width: 320, height: 200, data: vec![0; 192_000] }).unwrap_err().to_string();
+    assert!(e.contains("320x200") && e.contains("640x400"), "{e}");
+    assert!(r.apply(&RgbPicture { width: WIDTH, height: HEIGHT, data: vec![0; 3] }).is_err());
+}
+
+#[test]
+fn beyond_the_fold_and_outside_is_black() {
+    // Folds back at a tangent of 0.58: the corners of a wide output would show a ghost ring.
+    let mut info = camera("plumb_bob", &[-1.0, 0.0, 0.0, 0.0, 0.0]);
+    info.p = [120.0, 0.0, 319.5, 0.0, 0.0, 120.0, 199.5, 0.0, 0.0, 0.0, 1.0, 0.0];
+    let white = RgbPicture { width: WIDTH, height: HEIGHT, data: vec![255; WIDTH * HEIGHT * 3] };
+    let r = Rectifier::new(&info, false, 64, 40).unwrap();
+    let out = r.apply(&white).unwrap();
+    let k = r.intrinsics();
+    for (i, p) in out.data.chunks(3).enumerate() {
+        let ray = k.ray((i % 64) as f32 + 0.5, (i / 64) as f32 + 0.5);
+        let tan = ray.x.hypot(ray.y);
+        if tan > 0.7 {
+            assert_eq!(p, [0; 3], "{tan}");
+        } else if tan < 0.5 {
+            assert_eq!(p, [255; 3], "{tan}");
+        }
+    }
+}
