@@ -53,13 +53,7 @@ pub(crate) struct ViewAt<'a> {
 
 impl ViewAt<'_> {
     pub(crate) fn tracer<'b>(&'b self, sky: &'b Sky) -> Tracer<'b> {
-        Tracer {
-            scene: &self.scene,
-            tiles: &self.tiles,
-            sky,
-            camera: self.camera,
-            view_from_camera: self.view_from_camera,
-        }
+        Tracer { scene: &self.scene, tiles: &self.tiles, sky, camera: self.camera, view_from_camera: self.view_from_camera }
     }
 
     /// Direction of a picture point, map axes, z-depth 1.

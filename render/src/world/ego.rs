@@ -238,7 +238,8 @@ impl Springs {
         let pitch = 0.0022 * bump(11.0, c) - 0.004 * p.a;
         let roll = 0.003 * bump(17.0, d) + 0.004 * ride.yaw_rate * p.v;
         // z up, y left: a positive angle about y lowers the nose.
-        let rotation = DMat3::from_rotation_z(ride.yaw) * DMat3::from_rotation_y(pitch) * DMat3::from_rotation_x(roll);
+        let rotation =
+            DMat3::from_rotation_z(ride.yaw) * DMat3::from_rotation_y(pitch) * DMat3::from_rotation_x(roll);
         DAffine3::from_mat3_translation(rotation, DVec3::new(ride.pos.x, ride.pos.y, height))
     }
 }

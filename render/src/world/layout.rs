@@ -326,10 +326,9 @@ mod tests {
             let mut far = Vec::new();
             for k in 0..(route.length() / 2.0) as usize {
                 let p = route.at(k as f64 * 2.0).pos;
-                let on = layout
-                    .roads
-                    .iter()
-                    .any(|r| r.path.project(p).is_some_and(|(_, d)| d.abs() <= r.style.half_width - 0.9));
+                let on = layout.roads.iter().any(|r| {
+                    r.path.project(p).is_some_and(|(_, d)| d.abs() <= r.style.half_width - 0.9)
+                });
                 assert!(on, "seed {seed}: off the asphalt at {} m", 2 * k);
                 if k % 10 == 0 {
                     far.push((k, p));

@@ -108,7 +108,19 @@ impl RoadStyle {
         let centre = if lanes > 1 { 2 + dice.below(2) as u8 } else { dice.below(4) as u8 };
         let yellow = Dice::new(town.seed, &[21]).chance(0.4);
         let edge_lines = rural || dice.chance(0.3);
-        Self { district, lanes, lane_width, parking, half_width, pavement, speed, winding, centre, yellow, edge_lines }
+        Self {
+            district,
+            lanes,
+            lane_width,
+            parking,
+            half_width,
+            pavement,
+            speed,
+            winding,
+            centre,
+            yellow,
+            edge_lines,
+        }
     }
 }
 
@@ -143,7 +155,8 @@ pub(crate) struct Road {
 
 impl Road {
     pub(crate) fn new(seed: u64, index: usize, leg: usize, path: Path, style: RoadStyle) -> Self {
-        let ends: Vec<DVec2> = path.pieces().iter().map(|p| p.start).chain(std::iter::once(path.end().pos)).collect();
+        let ends: Vec<DVec2> =
+            path.pieces().iter().map(|p| p.start).chain(std::iter::once(path.end().pos)).collect();
         let (lo, hi) = ends.iter().fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(lo, hi), p| (lo.min(*p), hi.max(*p)));
         let centre = 0.5 * (lo + hi);
         // An arc bulges beyond its ends by less than a quarter of its length at the angles roads bend by.

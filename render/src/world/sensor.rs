@@ -64,8 +64,7 @@ mod tests {
         let light = Vec3::splat(0.4);
         let clean = Sensor::new(&camera, 1.0, 0.0, [1, 2, 3]).count(0.4);
         let sensor = Sensor::new(&camera, 1.0, 4.0, [1, 2, 3]);
-        let values: Vec<f32> =
-            (0..30_000).flat_map(|i| sensor.expose(light, i)).map(|v| f32::from(v) - clean).collect();
+        let values: Vec<f32> = (0..30_000).flat_map(|i| sensor.expose(light, i)).map(|v| f32::from(v) - clean).collect();
         let mean = values.iter().sum::<f32>() / values.len() as f32;
         let sigma = (values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / values.len() as f32).sqrt();
         // 90 000 draws: three sigma of the mean is 0.04, rounding adds 1/12 to the variance.

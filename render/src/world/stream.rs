@@ -5,9 +5,9 @@
 
 use super::dice::{Dice, fold};
 use super::ego::{Ride, ride};
+use super::people::{BICYCLE_WHEELBASE_M, CyclistModel, PersonModel};
 use super::part::PartSpec;
 use super::path::Path;
-use super::people::{BICYCLE_WHEELBASE_M, CyclistModel, PersonModel};
 use super::vehicles::{Build, VehicleModel};
 use glam::{DVec2, DVec3};
 
@@ -118,9 +118,7 @@ impl Pace {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Crowd {
     /// Vehicles, a share of them larger than cars.
-    Vehicles {
-        big: f64,
-    },
+    Vehicles { big: f64 },
     Cyclists,
     Pedestrians,
 }

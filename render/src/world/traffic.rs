@@ -336,14 +336,7 @@ impl Convoy {
                 // Amplitude and rate keep every companion's speed positive: |d ahead / dt| < 0.45. Neighbours on one side
                 // swing apart by less than their spacing in time and the gap in metres together.
                 let swing = dice.range(0.0, 0.4 / w).min(0.9 * ahead).min(1.5);
-                companions.push(Companion {
-                    model,
-                    ahead: sign * ahead,
-                    swing,
-                    w,
-                    phase: dice.range(0.0, TAU),
-                    gap: sign * gap,
-                });
+                companions.push(Companion { model, ahead: sign * ahead, swing, w, phase: dice.range(0.0, TAU), gap: sign * gap });
                 ahead += 1.5 + 1.5 + dice.range(0.5, 2.5);
             }
         }
@@ -361,8 +354,7 @@ impl Convoy {
 
     pub(crate) fn actor(&self, i: usize, time: f64) -> Actor {
         let c = &self.companions[i];
-        let (shift, rate) =
-            (c.ahead + c.swing * (c.w * time + c.phase).sin(), c.swing * c.w * (c.w * time + c.phase).cos());
+        let (shift, rate) = (c.ahead + c.swing * (c.w * time + c.phase).sin(), c.swing * c.w * (c.w * time + c.phase).cos());
         let p = self.profile.at(time + shift);
         let (s, v) = (p.s + c.gap, p.v * (1.0 + rate));
         let ride = ride(&self.route, s, v, f64::from(c.model.wheelbase));
