@@ -4,6 +4,7 @@ mod bench;
 mod config;
 mod demo;
 mod info;
+mod interrupt;
 mod render;
 mod replay;
 mod synth;

@@ -74,7 +74,8 @@ pub(super) fn run_into(bag: &Path, out: &Path, config: Config, progress: bool) -
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.model.threads).build_global();
     }
     let bar = progress_bar(progress, 0, "replaying");
-    let options = ReplayOptions { bag: bag.to_path_buf(), out: out.to_path_buf(), config };
+    let options =
+        ReplayOptions { bag: bag.to_path_buf(), out: out.to_path_buf(), config, stop: super::interrupt::stop_flag() };
     let metrics = replay::run(&options, &|done, total| {
         bar.set_length(total);
         bar.set_position(done);

@@ -4,6 +4,7 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Instant;
 
@@ -37,6 +38,8 @@ pub struct ReplayOptions {
     pub out: PathBuf,
     /// The configuration.
     pub config: Config,
+    /// Raised by whoever wants the run to end early; what was read until then is finished and written.
+    pub stop: Arc<AtomicBool>,
 }
 
 /// Called with images read so far and images in all.
@@ -64,9 +67,12 @@ pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
     let weights = engine.weights().to_string();
     let preset = engine.model_config().describe();
 
-    let ran = run_stages(&source, engine, sink, config, progress)?;
+    let ran = run_stages(&source, engine, sink, options, progress)?;
     let Ran { front, finished, sink } = ran;
-    let problems = source.problems();
+    let mut problems = source.problems();
+    if options.stop.load(Ordering::Relaxed) {
+        problems.push("stopped by the user before the end of the bag".into());
+    }
     problems.iter().for_each(|p| warn!("{p}"));
     let counts = Counts::new(&front, &finished, problems);
     let metrics = sink.finish(finished, counts, weights, preset, start.elapsed())?;
@@ -93,15 +99,22 @@ struct Ran {
     sink: Sink,
 }
 
-fn run_stages(source: &BagSource, engine: Engine, sink: Sink, config: &Config, progress: Progress) -> Result<Ran> {
+fn run_stages(
+    source: &BagSource,
+    engine: Engine,
+    sink: Sink,
+    options: &ReplayOptions,
+    progress: Progress,
+) -> Result<Ran> {
     let rig = source.rig();
     let (to_step, events) = bounded(EVENTS_AHEAD);
     let (to_sink, inputs) = bounded(STEPS_AHEAD);
     thread::scope(|scope| {
         let total = source.image_count();
-        let reader = scope.spawn(move || read(source, &to_step, total, progress));
+        let stop = &options.stop;
+        let reader = scope.spawn(move || read(source, &to_step, total, stop, progress));
         let writer = scope.spawn(move || write(sink, &inputs));
-        let stepped = step_all(source, &rig, engine, config, &events, &to_sink);
+        let stepped = step_all(source, &rig, engine, &options.config, &events, &to_sink);
         // Closing the channels ends the other stages, also when this one failed.
         drop(events);
         drop(to_sink);
@@ -115,7 +128,7 @@ fn run_stages(source: &BagSource, engine: Engine, sink: Sink, config: &Config, p
     })
 }
 
-fn read(source: &BagSource, to_step: &Sender<Event>, total: u64, progress: Progress) -> Result<()> {
+fn read(source: &BagSource, to_step: &Sender<Event>, total: u64, stop: &AtomicBool, progress: Progress) -> Result<()> {
     let mut images = 0;
     source.events(|event| {
         let is_image = matches!(event, Event::Image { .. } | Event::Lost { camera: Some(_), .. });
@@ -123,7 +136,7 @@ fn read(source: &BagSource, to_step: &Sender<Event>, total: u64, progress: Progr
         if is_image {
             progress(images, total.max(images));
         }
-        to_step.send(event).is_ok()
+        !stop.load(Ordering::Relaxed) && to_step.send(event).is_ok()
     })
 }
 
