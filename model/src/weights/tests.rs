@@ -1,6 +1,7 @@
 use std::path::PathBuf;
 
 use candle_core::{DType, Device};
+use proptest::prelude::*;
 
 use super::*;
 use crate::config::{SkyKind, VelocityKind};
@@ -169,6 +170,22 @@ fn cut_and_damaged_checkpoints_never_panic() {
         changed += usize::from(load(&path, None, &Device::Cpu).is_err());
     }
     assert!(changed > 100, "only {changed} of the damages were noticed");
+}
+
+proptest! {
+    #[test]
+    fn claimed_shapes_never_panic_or_allocate(
+        name in 0usize..1000,
+        shape in prop::collection::vec(prop::sample::select(vec![0usize, 1, 2, 3, 8, 64, 1 << 20, 1 << 40, usize::MAX]), 0..5),
+    ) {
+        let specs = tensor_specs(&small());
+        let spoiled = specs[name % specs.len()].name.clone();
+        let mut shapes: BTreeMap<_, _> = specs.into_iter().map(|s| (s.name, s.shape)).collect();
+        shapes.insert(spoiled, shape);
+        if let Ok(config) = infer_config(&shapes, None) && config.validate().is_ok() {
+            let _ = check_shapes(&config, shapes.iter().map(|(name, s)| (name.as_str(), &s[..])));
+        }
+    }
 }
 
 #[test]

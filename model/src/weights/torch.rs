@@ -197,6 +197,19 @@ impl Source for TorchFile {
 fn gather(tensor: &TensorRef, number: Number, bytes: &[u8]) -> Vec<f32> {
     let count: usize = tensor.shape.iter().product();
     let size = number.bytes();
+    if count == 0 {
+        return Vec::new();
+    }
+    let mut step = 1;
+    let row_major = tensor.shape.iter().zip(&tensor.strides).rev().all(|(&side, &stride)| {
+        let expected = step;
+        step *= side;
+        side == 1 || stride == expected
+    });
+    if row_major {
+        let own = &bytes[tensor.offset * size..(tensor.offset + count) * size];
+        return own.chunks_exact(size).map(|b| number.read(b)).collect();
+    }
     let mut index = vec![0usize; tensor.shape.len()];
     let mut out = Vec::with_capacity(count);
     for _ in 0..count {
