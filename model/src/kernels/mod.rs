@@ -1,7 +1,7 @@
 //! Fast f32 CPU kernels behind the network's operations: tiled attention, linear layers with fused epilogues, layer
 //! norm, row softmax.
 //!
-//! One source, three compilations: every kernel is one generic body over [`simd::Simd`], compiled for AVX2+FMA, for
+//! One source, three compilations: every kernel is one generic body over `simd::Simd`, compiled for AVX2+FMA, for
 //! AVX-512 and for the target's baseline, and picked at run time by [`Isa::detect`]. The AVX2 vectors are intrinsics;
 //! the other two are plain arrays the compiler turns into vectors.
 //!

@@ -31,13 +31,14 @@ impl Kernel for Chains {
     }
 }
 
-/// Floating-point operations per second of independent multiply-adds held in registers, on every thread of the pool.
-pub fn fma_flops(isa: Isa, steps: usize) -> f64 {
+/// Independent multiply-adds held in registers, on every thread of the pool: floating-point operations done, and
+/// seconds taken.
+pub fn fma(isa: Isa, steps: usize) -> (f64, f64) {
     let threads = rayon::current_num_threads();
     let start = Instant::now();
     let sum: f32 =
         (0..threads).into_par_iter().map(|t| dispatch(isa, Chains { steps, factor: 0.9 + 1e-3 * t as f32 })).sum();
     let seconds = start.elapsed().as_secs_f64();
     std::hint::black_box(sum);
-    (threads * steps * CHAINS * isa.lanes() * 2) as f64 / seconds
+    ((threads * steps * CHAINS * isa.lanes() * 2) as f64, seconds)
 }

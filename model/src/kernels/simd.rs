@@ -226,7 +226,7 @@ pub(crate) trait Kernel {
     fn run<S: Simd, const MR: usize>(self) -> Self::Out;
 }
 
-/// Runs `kernel` compiled for `isa`; a set the machine lacks runs the portable build.
+/// Runs `kernel` compiled for `isa`; panics if the machine lacks it (layouts were made for that set's tiles).
 pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Out {
     // aarch64 always has fused multiply-add; the x86-64 baseline never has.
     const BASELINE_FMA: bool = cfg!(target_arch = "aarch64");

@@ -3,11 +3,14 @@
 //! Blocking, from the inside out (the usual one, after Goto and van de Geijn, "Anatomy of High-Performance Matrix
 //! Multiplication", 2008): a tile of `tile_rows x tile_cols` accumulators stays in registers over `panel_depth`
 //! products; its right-hand panel (16 KiB) stays in the first-level cache while all row panels of the block pass by;
-//! the block of `x` (at most [`BLOCK_ROWS`] rows) is packed once and stays in the second level; partial sums wait in a
-//! block [`BLOCK_COLS`] wide. Weights are packed once per layer ([`PackedWeight`]).
+//! the block of `x` (at most `BLOCK_ROWS` rows) is packed once and stays in the second level; partial sums wait in a
+//! block `BLOCK_COLS` wide. Weights are packed once per layer ([`PackedWeight`]).
 //!
 //! Every output is summed in the order of `k`, in blocks fixed by `k` alone: neither the split over threads nor the
 //! row's place in `x` changes its bits.
+
+mod pack;
+mod tile;
 
 use std::cell::RefCell;
 
@@ -15,9 +18,13 @@ use rayon::prelude::*;
 
 use super::Isa;
 use super::aligned::Aligned;
-use super::math::activate;
 use super::simd::{Kernel, Simd, dispatch};
 use crate::ops::Activation;
+use pack::{Depths, pack_rows};
+use tile::finish;
+
+pub use pack::PackedWeight;
+pub(crate) use tile::tile;
 
 /// Rows of `x` a task works on at most: a multiple of both tile heights.
 const BLOCK_ROWS: usize = 96;
@@ -25,90 +32,6 @@ const BLOCK_ROWS: usize = 96;
 const BLOCK_COLS: usize = 512;
 /// Tasks per thread that keep threads busy to the end.
 const TASKS_PER_THREAD: usize = 4;
-
-/// `acc + a b` over `depth` products: `a[p * a_step + r * a_row]` for row `r`, `b` a packed panel of two vectors a row.
-///
-/// # Safety
-/// `a` must be readable at those indices for `p < depth`, `r < MR`; `b` for `depth * 2 * W` floats.
-#[inline(always)]
-pub(crate) unsafe fn tile<S: Simd, const MR: usize>(
-    depth: usize,
-    a: *const f32,
-    a_step: usize,
-    a_row: usize,
-    b: *const f32,
-    mut acc: [[S::V; 2]; MR],
-) -> [[S::V; 2]; MR] {
-    let (mut a, mut b) = (a, b);
-    for _ in 0..depth {
-        // SAFETY: the caller's contract; the pointers advance once per product.
-        unsafe {
-            let (b0, b1) = (S::load(b), S::load(b.add(S::W)));
-            for r in 0..MR {
-                let x = S::splat(*a.add(r * a_row));
-                acc[r][0] = S::mul_add(x, b0, acc[r][0]);
-                acc[r][1] = S::mul_add(x, b1, acc[r][1]);
-            }
-            a = a.add(a_step);
-            b = b.add(2 * S::W);
-        }
-    }
-    acc
-}
-
-/// Equal-sized slices of the summed dimension, none deeper than the panel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Depths {
-    k: usize,
-    step: usize,
-}
-
-impl Depths {
-    fn new(isa: Isa, k: usize) -> Self {
-        Self { k, step: k.div_ceil(k.div_ceil(isa.panel_depth())) }
-    }
-
-    fn ranges(self) -> impl Iterator<Item = (usize, usize)> {
-        (0..self.k).step_by(self.step).map(move |at| (at, self.step.min(self.k - at)))
-    }
-}
-
-/// A weight `(n, k)` laid out as the kernel reads it: per panel of `tile_cols` outputs, `k` rows of that many floats,
-/// zeros past `n`.
-#[derive(Debug)]
-pub struct PackedWeight {
-    isa: Isa,
-    n: usize,
-    k: usize,
-    data: Aligned,
-}
-
-impl PackedWeight {
-    /// Packs a row-major `(n, k)` weight, `k > 0`.
-    pub fn new(isa: Isa, weight: &[f32], n: usize, k: usize) -> Self {
-        assert!(k > 0 && weight.len() == n * k, "weight of {n} x {k}");
-        let nr = isa.tile_cols();
-        let mut data = Aligned::zeroed(n.div_ceil(nr) * nr * k);
-        data.as_mut_slice().par_chunks_mut(nr * k).zip(weight.par_chunks(nr * k)).for_each(|(panel, rows)| {
-            for (j, row) in rows.chunks_exact(k).enumerate() {
-                for (p, &w) in row.iter().enumerate() {
-                    panel[p * nr + j] = w;
-                }
-            }
-        });
-        Self { isa, n, k, data }
-    }
-
-    /// Outputs of the layer.
-    pub fn outputs(&self) -> usize {
-        self.n
-    }
-
-    /// Inputs of the layer.
-    pub fn inputs(&self) -> usize {
-        self.k
-    }
-}
 
 /// What happens to a finished sum.
 #[derive(Debug, Clone, Copy)]
@@ -147,28 +70,6 @@ struct Block<'a> {
     w: &'a PackedWeight,
     epilogue: Epilogue<'a>,
     out: &'a mut [f32],
-}
-
-/// Row panels of `MR`, each `k` columns of `MR` floats; rows past the end are zeros.
-#[inline(always)]
-fn pack_rows<const MR: usize>(x: &[f32], k: usize, packed: &mut [f32]) {
-    for (panel, rows) in packed.chunks_exact_mut(MR * k).zip(x.chunks(MR * k)) {
-        if rows.len() == MR * k {
-            let rows: [&[f32]; MR] = std::array::from_fn(|r| &rows[r * k..(r + 1) * k]);
-            for (p, column) in panel.chunks_exact_mut(MR).enumerate() {
-                for r in 0..MR {
-                    column[r] = rows[r][p];
-                }
-            }
-        } else {
-            panel.fill(0.0);
-            for (r, row) in rows.chunks_exact(k).enumerate() {
-                for (p, &v) in row.iter().enumerate() {
-                    panel[p * MR + r] = v;
-                }
-            }
-        }
-    }
 }
 
 impl Kernel for Block<'_> {
@@ -233,40 +134,6 @@ impl Kernel for Block<'_> {
             }
         }
     }
-}
-
-/// The epilogue on one tile row: `sums` has two whole vectors, the others as many columns as there are outputs.
-#[inline(always)]
-fn finish<S: Simd>(sums: &mut [f32], bias: Option<&[f32]>, act: Activation, residual: Option<&[f32]>, out: &mut [f32]) {
-    if out.len() == 2 * S::W && sums.len() == out.len() {
-        for at in [0, S::W] {
-            // SAFETY: all four have two vectors' worth of floats.
-            unsafe {
-                let mut v = S::load(sums.as_ptr().add(at));
-                if let Some(bias) = bias {
-                    v = S::add(v, S::load(bias.as_ptr().add(at)));
-                }
-                v = activate::<S>(act, v);
-                if let Some(residual) = residual {
-                    v = S::add(v, S::load(residual.as_ptr().add(at)));
-                }
-                S::store(out.as_mut_ptr().add(at), v);
-            }
-        }
-        return;
-    }
-    if let Some(bias) = bias {
-        sums.iter_mut().zip(bias).for_each(|(s, b)| *s += b);
-    }
-    for half in sums.chunks_exact_mut(S::W) {
-        // SAFETY: each half is one vector.
-        unsafe { S::store(half.as_mut_ptr(), activate::<S>(act, S::load(half.as_ptr()))) };
-    }
-    if let Some(residual) = residual {
-        sums.iter_mut().zip(residual).for_each(|(s, r)| *s += r);
-    }
-    let width = out.len();
-    out.copy_from_slice(&sums[..width]);
 }
 
 /// Panics unless the lengths fit `m` rows through the layer.

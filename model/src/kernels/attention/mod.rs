@@ -2,13 +2,14 @@
 //! (Milakov and Gimelshein, "Online normalizer calculation for softmax", 2018; Dao et al., "FlashAttention", 2022).
 //!
 //! Keys and values are first packed per head into panels of one register tile's width. A task is one block of
-//! [`BLOCK_QUERIES`] queries of one head; for each block of [`BLOCK_KEYS`] keys it computes the logits in register
+//! `BLOCK_QUERIES` queries of one head; for each block of `BLOCK_KEYS` keys it computes the logits in register
 //! tiles (in units of log 2, so that the softmax is a power of two), turns them into weights row by row, and adds the
 //! weighted values to its output block. All blocks of a task fit the second-level cache.
 //!
 //! Logits may be of any finite size: the largest so far is subtracted before the power is taken, so weights are at most
-//! 1 and the sum at least 1. A NaN in a query, key or value reaches every output
-//! that depends on it.
+//! 1 and the sum at least 1. A NaN in a query, key or value reaches every output that depends on it.
+
+mod pack;
 
 use rayon::prelude::*;
 
@@ -17,76 +18,14 @@ use super::aligned::Aligned;
 use super::gemm::tile;
 use super::math::exp2;
 use super::simd::{Kernel, Simd, dispatch};
+use pack::{Layout, Source, pack};
+
+pub use pack::Shape;
 
 /// Queries of a task: a multiple of both tile heights.
 const BLOCK_QUERIES: usize = 96;
 /// Keys taken at a time. The logits of a task are `96 x 256` floats, 96 KiB.
 const BLOCK_KEYS: usize = 256;
-
-/// The sizes of one call.
-#[derive(Debug, Clone, Copy)]
-pub struct Shape {
-    /// Independent sequences.
-    pub batch: usize,
-    /// Tokens of each.
-    pub tokens: usize,
-    /// Heads.
-    pub heads: usize,
-    /// Channels of a head.
-    pub head_dim: usize,
-}
-
-impl Shape {
-    /// Channels of the result.
-    fn width(&self) -> usize {
-        self.heads * self.head_dim
-    }
-}
-
-/// How the packed keys and values of one block of keys lie in memory.
-#[derive(Clone, Copy)]
-struct Layout {
-    /// Floats of a register tile's row.
-    nr: usize,
-    /// `head_dim` rounded up to whole tiles.
-    value_dim: usize,
-    /// Floats of a block's keys; its values follow.
-    key_floats: usize,
-    /// Floats of a block.
-    block_floats: usize,
-    /// Blocks of a head.
-    blocks: usize,
-}
-
-impl Layout {
-    fn new(isa: Isa, shape: &Shape) -> Self {
-        let nr = isa.tile_cols();
-        let value_dim = shape.head_dim.next_multiple_of(nr);
-        let key_floats = BLOCK_KEYS * shape.head_dim;
-        let block_floats = (key_floats + BLOCK_KEYS * value_dim).next_multiple_of(16);
-        Self { nr, value_dim, key_floats, block_floats, blocks: shape.tokens.div_ceil(BLOCK_KEYS) }
-    }
-}
-
-/// Packs the keys `(panel, channel, key)` and values `(panel, key, channel)` of one block; `block` starts as zeros.
-fn pack(qkv: &[f32], shape: &Shape, layout: &Layout, index: usize, block: &mut [f32]) {
-    let (head_index, first) = (index / layout.blocks, index % layout.blocks * BLOCK_KEYS);
-    let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
-    let (d, width, nr) = (shape.head_dim, shape.width(), layout.nr);
-    let (keys, values) = block.split_at_mut(layout.key_floats);
-    for t in 0..BLOCK_KEYS.min(shape.tokens - first) {
-        let row = &qkv[(batch * shape.tokens + first + t) * 3 * width..][..3 * width];
-        let key = &row[width + head * d..][..d];
-        let panel = &mut keys[t / nr * d * nr..][..d * nr];
-        for (c, &x) in key.iter().enumerate() {
-            panel[c * nr + t % nr] = x;
-        }
-        let value = &row[2 * width + head * d..][..d];
-        for (p, part) in value.chunks(nr).enumerate() {
-            values[(p * BLOCK_KEYS + t) * nr..][..part.len()].copy_from_slice(part);
-        }
-    }
-}
 
 /// Working memory of a task, kept by its thread.
 struct Scratch {
@@ -128,17 +67,7 @@ impl Output {
     }
 }
 
-/// One block of queries of one head.
-#[derive(Clone, Copy)]
-struct Source<'a> {
-    qkv: &'a [f32],
-    shape: &'a Shape,
-    batch: usize,
-    head: usize,
-    first: usize,
-}
-
-/// What is done with it.
+/// One block of queries of one head, and what it needs.
 struct Task<'a> {
     source: Source<'a>,
     layout: &'a Layout,
@@ -146,23 +75,6 @@ struct Task<'a> {
     blocks: &'a [f32],
     scratch: &'a mut Scratch,
     out: Output,
-}
-
-impl Source<'_> {
-    /// Row panels of `MR` queries, scaled; rows past the end are zeros.
-    #[inline(always)]
-    fn pack_queries<const MR: usize>(&self, packed: &mut [f32], queries: usize) {
-        let (d, width) = (self.shape.head_dim, self.shape.width());
-        let scale = std::f32::consts::LOG2_E / (d as f32).sqrt();
-        packed.fill(0.0);
-        for r in 0..queries {
-            let row = (self.batch * self.shape.tokens + self.first + r) * 3 * width + self.head * d;
-            let panel = &mut packed[r / MR * d * MR..][..d * MR];
-            for (c, &x) in self.qkv[row..row + d].iter().enumerate() {
-                panel[c * MR + r % MR] = x * scale;
-            }
-        }
-    }
 }
 
 impl Kernel for Task<'_> {
@@ -219,7 +131,7 @@ impl Kernel for Task<'_> {
             }
 
             for c in 0..layout.value_dim / nr {
-                let b = &values[c * BLOCK_KEYS * nr..][..count * nr];
+                let b = &values[c * layout.keys * nr..][..count * nr];
                 for i in 0..panels {
                     let a = &weights[i * MR * BLOCK_KEYS..][..MR * BLOCK_KEYS];
                     let to = &mut sums[(c * BLOCK_QUERIES + i * MR) * nr..][..MR * nr];
@@ -306,7 +218,7 @@ fn row_weights<S: Simd>(row: &mut [f32], top: f32) -> f32 {
 /// `softmax(q k^T / sqrt(head_dim)) v` for `qkv` `(batch, tokens, 3 * heads * head_dim)` with rows `[q | k | v]`; `out` is
 /// `(batch, tokens, heads * head_dim)`.
 ///
-/// Panics when the lengths disagree (callers take them from tensor shapes).
+/// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
 pub fn attention(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) {
     let rows = shape.batch * shape.tokens;
     assert_eq!(qkv.len(), rows * 3 * shape.width(), "qkv of {shape:?}");

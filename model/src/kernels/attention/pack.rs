@@ -1,0 +1,99 @@
+//! The layouts attention reads: keys and values in panels of tile columns, queries in panels of tile rows.
+
+use super::BLOCK_KEYS;
+use crate::kernels::Isa;
+
+/// The sizes of one call.
+#[derive(Debug, Clone, Copy)]
+pub struct Shape {
+    /// Independent sequences.
+    pub batch: usize,
+    /// Tokens of each.
+    pub tokens: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Channels of a head.
+    pub head_dim: usize,
+}
+
+impl Shape {
+    /// Channels of the result.
+    pub(super) fn width(&self) -> usize {
+        self.heads * self.head_dim
+    }
+}
+
+/// How the packed keys and values of one block of keys lie in memory.
+#[derive(Clone, Copy)]
+pub(super) struct Layout {
+    /// Floats of a register tile's row.
+    pub(super) nr: usize,
+    /// `head_dim` rounded up to whole tiles.
+    pub(super) value_dim: usize,
+    /// Keys a block has room for: fewer than [`BLOCK_KEYS`] only for sequences shorter than that.
+    pub(super) keys: usize,
+    /// Floats of a block's keys; its values follow.
+    pub(super) key_floats: usize,
+    /// Floats of a block.
+    pub(super) block_floats: usize,
+    /// Blocks of a head.
+    pub(super) blocks: usize,
+}
+
+impl Layout {
+    pub(super) fn new(isa: Isa, shape: &Shape) -> Self {
+        let nr = isa.tile_cols();
+        let value_dim = shape.head_dim.next_multiple_of(nr);
+        let keys = BLOCK_KEYS.min(shape.tokens.next_multiple_of(nr));
+        let key_floats = keys * shape.head_dim;
+        let block_floats = (key_floats + keys * value_dim).next_multiple_of(16);
+        Self { nr, value_dim, keys, key_floats, block_floats, blocks: shape.tokens.div_ceil(BLOCK_KEYS) }
+    }
+}
+
+/// Packs the keys `(panel, channel, key)` and values `(panel, key, channel)` of one block; `block` starts as zeros.
+pub(super) fn pack(qkv: &[f32], shape: &Shape, layout: &Layout, index: usize, block: &mut [f32]) {
+    let (head_index, first) = (index / layout.blocks, index % layout.blocks * BLOCK_KEYS);
+    let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
+    let (d, width, nr) = (shape.head_dim, shape.width(), layout.nr);
+    let (keys, values) = block.split_at_mut(layout.key_floats);
+    for t in 0..BLOCK_KEYS.min(shape.tokens - first) {
+        let row = &qkv[(batch * shape.tokens + first + t) * 3 * width..][..3 * width];
+        let key = &row[width + head * d..][..d];
+        let panel = &mut keys[t / nr * d * nr..][..d * nr];
+        for (c, &x) in key.iter().enumerate() {
+            panel[c * nr + t % nr] = x;
+        }
+        let value = &row[2 * width + head * d..][..d];
+        for (p, part) in value.chunks(nr).enumerate() {
+            values[(p * layout.keys + t) * nr..][..part.len()].copy_from_slice(part);
+        }
+    }
+}
+
+/// One block of queries of one head.
+#[derive(Clone, Copy)]
+pub(super) struct Source<'a> {
+    pub(super) qkv: &'a [f32],
+    pub(super) shape: &'a Shape,
+    pub(super) batch: usize,
+    pub(super) head: usize,
+    pub(super) first: usize,
+}
+
+impl Source<'_> {
+    /// Row panels of `MR` queries, scaled; rows past the end are zeros.
+    #[inline(always)]
+    pub(super) fn pack_queries<const MR: usize>(&self, packed: &mut [f32], queries: usize) {
+        let (d, width) = (self.shape.head_dim, self.shape.width());
+        let scale = std::f32::consts::LOG2_E / (d as f32).sqrt();
+        packed.fill(0.0);
+        for r in 0..queries {
+            let row = (self.batch * self.shape.tokens + self.first + r) * 3 * width + self.head * d;
+            let panel = &mut packed[r / MR * d * MR..][..d * MR];
+            for (c, &x) in self.qkv[row..row + d].iter().enumerate() {
+                panel[c * MR + r % MR] = x * scale;
+            }
+        }
+    }
+}

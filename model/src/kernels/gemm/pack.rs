@@ -1,0 +1,82 @@
+//! The layouts the kernel reads: weights in panels of tile columns, rows of the input in panels of tile rows.
+
+use rayon::prelude::*;
+
+use crate::kernels::Isa;
+use crate::kernels::aligned::Aligned;
+
+/// Equal-sized slices of the summed dimension, none deeper than the panel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Depths {
+    k: usize,
+    step: usize,
+}
+
+impl Depths {
+    pub(super) fn new(isa: Isa, k: usize) -> Self {
+        Self { k, step: k.div_ceil(k.div_ceil(isa.panel_depth())) }
+    }
+
+    pub(super) fn ranges(self) -> impl Iterator<Item = (usize, usize)> {
+        (0..self.k).step_by(self.step).map(move |at| (at, self.step.min(self.k - at)))
+    }
+}
+
+/// A weight `(n, k)` laid out as the kernel reads it: per panel of `tile_cols` outputs, `k` rows of that many floats,
+/// zeros past `n`.
+#[derive(Debug)]
+pub struct PackedWeight {
+    pub(super) isa: Isa,
+    pub(super) n: usize,
+    pub(super) k: usize,
+    pub(super) data: Aligned,
+}
+
+impl PackedWeight {
+    /// Packs a row-major `(n, k)` weight, `k > 0`.
+    pub fn new(isa: Isa, weight: &[f32], n: usize, k: usize) -> Self {
+        assert!(k > 0 && weight.len() == n * k, "weight of {n} x {k}");
+        let nr = isa.tile_cols();
+        let mut data = Aligned::zeroed(n.div_ceil(nr) * nr * k);
+        data.as_mut_slice().par_chunks_mut(nr * k).zip(weight.par_chunks(nr * k)).for_each(|(panel, rows)| {
+            for (j, row) in rows.chunks_exact(k).enumerate() {
+                for (p, &w) in row.iter().enumerate() {
+                    panel[p * nr + j] = w;
+                }
+            }
+        });
+        Self { isa, n, k, data }
+    }
+
+    /// Outputs of the layer.
+    pub fn outputs(&self) -> usize {
+        self.n
+    }
+
+    /// Inputs of the layer.
+    pub fn inputs(&self) -> usize {
+        self.k
+    }
+}
+
+/// Row panels of `MR`, each `k` columns of `MR` floats; rows past the end are zeros.
+#[inline(always)]
+pub(super) fn pack_rows<const MR: usize>(x: &[f32], k: usize, packed: &mut [f32]) {
+    for (panel, rows) in packed.chunks_exact_mut(MR * k).zip(x.chunks(MR * k)) {
+        if rows.len() == MR * k {
+            let rows: [&[f32]; MR] = std::array::from_fn(|r| &rows[r * k..(r + 1) * k]);
+            for (p, column) in panel.chunks_exact_mut(MR).enumerate() {
+                for r in 0..MR {
+                    column[r] = rows[r][p];
+                }
+            }
+        } else {
+            panel.fill(0.0);
+            for (r, row) in rows.chunks_exact(k).enumerate() {
+                for (p, &v) in row.iter().enumerate() {
+                    panel[p * MR + r] = v;
+                }
+            }
+        }
+    }
+}
