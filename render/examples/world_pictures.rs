@@ -68,7 +68,11 @@ fn sheet(frames: &[WorldFrame]) -> Vec<u8> {
                         2 => f.flow[i].map(|v| byte(0.5 + 0.5 * v / FLOW_FULL_MPS)),
                         _ => {
                             let h = u32::from(f.instance[i]).wrapping_mul(2_654_435_761);
-                            if f.instance[i] == 0 { [0; 3] } else { [(h >> 24) as u8 | 64, (h >> 16) as u8, (h >> 8) as u8] }
+                            if f.instance[i] == 0 {
+                                [0; 3]
+                            } else {
+                                [(h >> 24) as u8 | 64, (h >> 16) as u8, (h >> 8) as u8]
+                            }
                         }
                     };
                     out.extend_from_slice(&pixel);

@@ -72,7 +72,13 @@ impl Plan {
                 let roof = if dice.chance(0.5) { Roof::Gable } else { Roof::Flat };
                 (dice.range32(6.0, 14.0), dice.range32(9.0, 12.0), 2 + dice.below(4), dice.range(0.0, 1.5), roof)
             }
-            Industrial => (dice.range32(15.0, 40.0), dice.range32(15.0, 30.0), 2 + dice.below(2), dice.range(2.0, 12.0), Roof::Flat),
+            Industrial => (
+                dice.range32(15.0, 40.0),
+                dice.range32(15.0, 30.0),
+                2 + dice.below(2),
+                dice.range(2.0, 12.0),
+                Roof::Flat,
+            ),
             Suburb | Park | Rural => {
                 let roof = if dice.chance(0.65) { Roof::Gable } else { Roof::Hip };
                 (dice.range32(8.0, 14.0), dice.range32(8.0, 11.0), 1 + dice.below(2), dice.range(3.0, 9.0), roof)
@@ -82,7 +88,11 @@ impl Plan {
         let facade = Facade {
             cell: if hall { dice.range32(4.0, 7.0) } else { dice.range32(1.8, 3.6) },
             floor,
-            open: if hall { [0.7, dice.range32(0.15, 0.35)] } else { [dice.range32(0.35, 0.85), dice.range32(0.4, 0.7)] },
+            open: if hall {
+                [0.7, dice.range32(0.15, 0.35)]
+            } else {
+                [dice.range32(0.35, 0.85), dice.range32(0.4, 0.7)]
+            },
             shop: matches!(district, Downtown) && dice.chance(0.8) || matches!(district, Terraces) && dice.chance(0.3),
             brick: dice.chance(0.35) && !hall,
         };
@@ -166,7 +176,12 @@ pub(crate) fn line_road(site: &mut Site, road: &Road) {
                 let yaw = if side > 0.0 { at.heading } else { at.heading + 2.0 * FRAC_PI_2 };
                 let parts = plan.parts(&mut dice);
                 site.add(pos, yaw, parts);
-                s += front + if matches!(road.style.district, District::Downtown | District::Terraces) { 0.03 } else { dice.range(2.0, 9.0) };
+                s += front
+                    + if matches!(road.style.district, District::Downtown | District::Terraces) {
+                        0.03
+                    } else {
+                        dice.range(2.0, 9.0)
+                    };
             } else {
                 s += 4.0;
             }
@@ -193,7 +208,8 @@ pub(crate) fn backdrop(site: &mut Site, layout: &Layout, road: &Road) {
         let plot = Footprint { centre: pos, dir: DVec2::from_angle(yaw), half };
         let rural = matches!(road.style.district, District::Rural | District::Park);
         if dice.chance(if rural { 0.25 } else { 0.9 }) && site.claim(plot, 6.0) {
-            let facade = Facade { cell: dice.range32(2.0, 4.0), floor: 3.1, open: [0.5, 0.5], shop: false, brick: false };
+            let facade =
+                Facade { cell: dice.range32(2.0, 4.0), floor: 3.1, open: [0.5, 0.5], shop: false, brick: false };
             let wall = Material::new(Surface::Facade(facade), wall_color(&mut dice)).seed(dice.next());
             let shape = Shape::cuboid(size[0], size[1], size[2]);
             let body = PartSpec::fixed(shape, Vec3::new(0.0, 0.0, 0.5 * size[2]), wall);
@@ -201,7 +217,8 @@ pub(crate) fn backdrop(site: &mut Site, layout: &Layout, road: &Road) {
             if size[2] < 12.0 {
                 let pitch = 0.35 * size[1];
                 let roof = Shape::taper(size[0] + 0.4, size[1] + 0.8, pitch, Vec2::new(size[0], 0.05), Vec2::ZERO);
-                let tiles = Material::new(Surface::Courses { step: 0.4 }, dice.pick(&[rgb(130, 65, 50), rgb(80, 75, 75)]));
+                let tiles =
+                    Material::new(Surface::Courses { step: 0.4 }, dice.pick(&[rgb(130, 65, 50), rgb(80, 75, 75)]));
                 parts.push(PartSpec::fixed(roof, Vec3::new(0.0, 0.0, size[2] + 0.5 * pitch), tiles));
             }
             site.add(pos, yaw, parts);

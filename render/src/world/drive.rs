@@ -53,7 +53,13 @@ pub(crate) struct ViewAt<'a> {
 
 impl ViewAt<'_> {
     pub(crate) fn tracer<'b>(&'b self, sky: &'b Sky) -> Tracer<'b> {
-        Tracer { scene: &self.scene, tiles: &self.tiles, sky, camera: self.camera, view_from_camera: self.view_from_camera }
+        Tracer {
+            scene: &self.scene,
+            tiles: &self.tiles,
+            sky,
+            camera: self.camera,
+            view_from_camera: self.view_from_camera,
+        }
     }
 
     /// Direction of a picture point, map axes, z-depth 1.
@@ -98,7 +104,7 @@ impl Drive {
             options: options.clone(),
             springs: Springs::new(seed),
             sky: Sky::new(seed),
-            brightness: dice.range32(0.75, 1.1),
+            brightness: dice.range32(1.25, 1.9),
             layout,
             convoy,
             legs: LegStore::default(),

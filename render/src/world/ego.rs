@@ -224,7 +224,7 @@ pub(crate) struct Springs {
 impl Springs {
     pub(crate) fn new(seed: u64) -> Self {
         let mut dice = Dice::new(seed, &[31]);
-        Self { phase: std::array::from_fn(|_| dice.range(0.0, 6.28)), size: dice.range(0.3, 1.2) }
+        Self { phase: std::array::from_fn(|_| dice.range(0.0, std::f64::consts::TAU)), size: dice.range(0.3, 1.2) }
     }
 
     /// local_from_base at a time.
@@ -238,8 +238,7 @@ impl Springs {
         let pitch = 0.0022 * bump(11.0, c) - 0.004 * p.a;
         let roll = 0.003 * bump(17.0, d) + 0.004 * ride.yaw_rate * p.v;
         // z up, y left: a positive angle about y lowers the nose.
-        let rotation =
-            DMat3::from_rotation_z(ride.yaw) * DMat3::from_rotation_y(pitch) * DMat3::from_rotation_x(roll);
+        let rotation = DMat3::from_rotation_z(ride.yaw) * DMat3::from_rotation_y(pitch) * DMat3::from_rotation_x(roll);
         DAffine3::from_mat3_translation(rotation, DVec3::new(ride.pos.x, ride.pos.y, height))
     }
 }

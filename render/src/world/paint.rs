@@ -65,7 +65,8 @@ fn pavement(road: &PaintedRoad, uv: Vec2, soft: f32) -> Look {
     let f = soft / step;
     let joints = 1.0 - (1.0 - pulse(q.x, 0.0, 0.05, f)) * (1.0 - pulse(q.y, 0.0, 0.05, f));
     let near = (1.0 - f).clamp(0.0, 1.0);
-    let tone = 0.1 * near * cell(q, road.seed) + 0.08 * grain(uv, 0.4, soft, road.seed) + 0.08 * grain(uv, 6.0, soft, 8);
+    let tone =
+        0.1 * near * cell(q, road.seed) + 0.08 * grain(uv, 0.4, soft, road.seed) + 0.08 * grain(uv, 6.0, soft, 8);
     Look::matt(tint * (1.0 + tone) * (1.0 - 0.35 * joints))
 }
 
@@ -78,7 +79,8 @@ fn field(world: Vec2, soft: f32, road: Option<&PaintedRoad>) -> Look {
         _ => 0.0,
     };
     let patch = grain(world, 1.0 / 16.0, soft, 21);
-    let blades = 0.22 * grain(world, 8.0, soft, 22) + 0.15 * grain(world, 2.0, soft, 23) + 0.15 * grain(world, 0.25, soft, 24);
+    let blades =
+        0.22 * grain(world, 8.0, soft, 22) + 0.15 * grain(world, 2.0, soft, 23) + 0.15 * grain(world, 0.25, soft, 24);
     let grass = Vec3::new(0.1, 0.15, 0.045) + Vec3::new(0.07, 0.04, 0.01) * (patch.max(-0.6) + 0.3);
     let grass = grass * (1.0 + blades);
     let paved = Vec3::new(0.25, 0.24, 0.22) * (1.0 + 0.15 * grain(world, 4.0, soft, 25) + 0.12 * patch);
@@ -87,7 +89,9 @@ fn field(world: Vec2, soft: f32, road: Option<&PaintedRoad>) -> Look {
 
 fn asphalt(ground: &Ground, road: &PaintedRoad, hit: &GroundHit, p: Vec2, uv: Vec2, foot: &Foot, soft: f32) -> Look {
     let base = 0.07 + 0.05 * ((road.seed >> 8) % 64) as f32 / 64.0;
-    let grainy = 0.16 * grain(uv, 10.0, soft, road.seed) + 0.1 * grain(uv, 2.5, soft, 31) + 0.14 * grain(uv * Vec2::new(0.2, 1.0), 0.6, soft, 32);
+    let grainy = 0.16 * grain(uv, 10.0, soft, road.seed)
+        + 0.1 * grain(uv, 2.5, soft, 31)
+        + 0.14 * grain(uv * Vec2::new(0.2, 1.0), 0.6, soft, 32);
     let patch = if cell(uv * Vec2::new(0.12, 0.28), road.seed ^ 33) > 0.86 { 0.72 } else { 1.0 };
     let tint = Vec3::new(1.0, 1.0, 1.03) * base;
     let mut color = tint * (1.0 + grainy) * patch;

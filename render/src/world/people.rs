@@ -51,7 +51,13 @@ impl PersonModel {
                 cloth(dice)
             },
             skin: dice.pick(&[rgb(232, 190, 165), rgb(215, 170, 140), rgb(170, 120, 90), rgb(110, 75, 55)]),
-            hair: dice.pick(&[rgb(30, 24, 20), rgb(70, 48, 32), rgb(150, 115, 70), rgb(150, 150, 150), rgb(60, 60, 90)]),
+            hair: dice.pick(&[
+                rgb(30, 24, 20),
+                rgb(70, 48, 32),
+                rgb(150, 115, 70),
+                rgb(150, 150, 150),
+                rgb(60, 60, 90),
+            ]),
             long_sleeves: dice.chance(0.7),
             backpack: dice.chance(0.2),
             start: dice.range(0.0, TAU),
@@ -71,7 +77,8 @@ impl PersonModel {
         let coat = Material::new(Surface::Rough, self.coat);
         let legs = Material::new(Surface::Rough, self.trousers);
         let skin = Material::new(Surface::Plain, self.skin);
-        let torso = Shape::taper(0.11 * h, 0.165 * h, 0.33 * h, Vec2::new(0.12 * h, 0.225 * h), Vec2::new(0.02 * h, 0.0));
+        let torso =
+            Shape::taper(0.11 * h, 0.165 * h, 0.33 * h, Vec2::new(0.12 * h, 0.225 * h), Vec2::new(0.02 * h, 0.0));
         out.push(hips.at(Vec3::new(0.0, 0.0, 0.165 * h)).part(torso, coat));
         let head = hips.at(Vec3::new(0.03 * h, 0.0, 0.425 * h));
         out.push(head.part(Shape::Ellipsoid { radii: Vec3::new(0.056, 0.046, 0.068) * h }, skin));
@@ -90,7 +97,10 @@ impl PersonModel {
             let lifted = cos.max(0.0);
             let (knee, knee_rate) = (0.9 * lifted * lifted, -1.8 * lifted * sin * rate);
             let hip = hips.at(Vec3::new(0.0, side * 0.05 * h, 0.0)).pitched(thigh, thigh_rate);
-            let limb = |length: f32, radius: f32| Shape::Capsule { radius: radius * h, half: 0.5 * length * h - 0.5 * radius * h };
+            let limb = |length: f32, radius: f32| Shape::Capsule {
+                radius: radius * h,
+                half: 0.5 * length * h - 0.5 * radius * h,
+            };
             out.push(hip.at(Vec3::new(0.0, 0.0, -0.12 * h)).part(limb(0.24, 0.045), legs));
             let shin = hip.at(Vec3::new(0.0, 0.0, -0.24 * h)).pitched(knee, knee_rate);
             out.push(shin.at(Vec3::new(0.0, 0.0, -0.115 * h)).part(limb(0.23, 0.034), legs));
@@ -171,7 +181,11 @@ impl CyclistModel {
         out.push(PartSpec::fixed(torso, 0.5 * (hip + shoulders), coat).turned(rot));
         let head = shoulders + Vec3::new(0.07, 0.0, 0.12 * h);
         out.push(PartSpec::fixed(Shape::Ellipsoid { radii: Vec3::new(0.056, 0.046, 0.068) * h }, head, skin));
-        let cap = if self.helmet { Material::new(Surface::Sheen, self.frame) } else { Material::new(Surface::Rough, who.hair) };
+        let cap = if self.helmet {
+            Material::new(Surface::Sheen, self.frame)
+        } else {
+            Material::new(Surface::Rough, who.hair)
+        };
         let shape = Shape::Ellipsoid { radii: Vec3::new(0.068, 0.054, 0.055) * h };
         out.push(PartSpec::fixed(shape, head + Vec3::new(-0.01, 0.0, 0.025 * h), cap));
         for side in [-1.0f32, 1.0] {

@@ -56,7 +56,8 @@ pub(crate) fn rig(options: &DriveOptions) -> Vec<DriveCamera> {
         let body_from_optical = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
         let turn = DMat3::from_rotation_z(yaw) * DMat3::from_rotation_y(pitch) * DMat3::from_rotation_x(roll);
         let at = DVec3::new(place[0], place[1], height);
-        let (gain, balance) = (dice.range32(-0.3, 0.3).exp2(), [dice.range32(0.94, 1.06), 1.0, dice.range32(0.93, 1.07)]);
+        let (gain, balance) =
+            (dice.range32(-0.3, 0.3).exp2(), [dice.range32(0.94, 1.06), 1.0, dice.range32(0.93, 1.07)]);
         DriveCamera {
             name: name.to_owned(),
             intrinsics,

@@ -30,7 +30,7 @@ impl Sky {
         let mut dice = Dice::new(seed, &[70]);
         let overcast = dice.chance(0.28);
         let height = if overcast { dice.range32(1.1, 1.4) } else { dice.range32(0.2, 1.15) };
-        let turn = dice.range32(-3.1416, 3.1416);
+        let turn = dice.range32(0.0, std::f32::consts::TAU);
         let sun = Vec3::new(turn.cos() * height.cos(), turn.sin() * height.cos(), height.sin());
         // The lower the sun, the warmer and weaker.
         let low = if overcast { 0.0 } else { (1.0 - height / 0.7).max(0.0) };
@@ -44,7 +44,11 @@ impl Sky {
             let blue = Vec3::new(0.16, 0.34, 0.78) * bright;
             (blue, Vec3::new(0.72 + 0.25 * low, 0.8 - 0.05 * low, 0.95 - 0.3 * low) * bright)
         };
-        let above = if overcast { Vec3::new(0.8, 0.83, 0.88) * dice.range32(0.6, 0.95) } else { Vec3::new(0.42, 0.5, 0.66) * bright * 0.8 };
+        let above = if overcast {
+            Vec3::new(0.8, 0.83, 0.88) * dice.range32(0.6, 0.95)
+        } else {
+            Vec3::new(0.42, 0.5, 0.66) * bright * 0.62
+        };
         let below = (0.25 * above + 0.12 * strength * warm * sun.z) * Vec3::new(0.9, 0.85, 0.75);
         Self {
             sun,
@@ -53,7 +57,11 @@ impl Sky {
             below,
             zenith,
             horizon,
-            cloud_color: if overcast { zenith * 0.75 } else { Vec3::splat(0.95 * bright) * (0.5 * Vec3::ONE + 0.5 * warm) },
+            cloud_color: if overcast {
+                zenith * 0.75
+            } else {
+                Vec3::splat(0.95 * bright) * (0.5 * Vec3::ONE + 0.5 * warm)
+            },
             clear: if overcast { dice.range32(-0.5, -0.1) } else { dice.range32(-0.25, 0.6) },
             drift: Vec2::new(dice.range32(0.0, 500.0), dice.range32(0.0, 500.0)),
             seed: dice.next() as u32,

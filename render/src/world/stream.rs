@@ -5,9 +5,9 @@
 
 use super::dice::{Dice, fold};
 use super::ego::{Ride, ride};
-use super::people::{BICYCLE_WHEELBASE_M, CyclistModel, PersonModel};
 use super::part::PartSpec;
 use super::path::Path;
+use super::people::{BICYCLE_WHEELBASE_M, CyclistModel, PersonModel};
 use super::vehicles::{Build, VehicleModel};
 use glam::{DVec2, DVec3};
 
@@ -118,7 +118,9 @@ impl Pace {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Crowd {
     /// Vehicles, a share of them larger than cars.
-    Vehicles { big: f64 },
+    Vehicles {
+        big: f64,
+    },
     Cyclists,
     Pedestrians,
 }
@@ -140,8 +142,6 @@ pub(crate) struct Stream {
     /// Height of the ground walked on, and the stretches of the path that lie on asphalt instead.
     pub height: f64,
     pub dips: Vec<(f64, f64)>,
-    /// Offset to the left of the road's centreline, or, for those who cross it, none.
-    pub lateral: Option<f64>,
 }
 
 /// Length over which a pedestrian steps up or down a kerb.
@@ -302,7 +302,6 @@ mod tests {
                 ids: 8,
                 height: 0.12,
                 dips: vec![(10.0, 14.0)],
-                lateral: None,
             };
             let h = 1e-4;
             for k in 0..150 {

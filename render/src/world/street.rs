@@ -39,11 +39,20 @@ fn tree(dice: &mut Dice, town: &Town, kind: Tree) -> Vec<PartSpec> {
             let crown = h * dice.range32(0.24, 0.34);
             parts.push(trunk(h * 0.5, h * 0.022 + 0.03));
             let core = Vec3::new(0.0, 0.0, h * 0.66);
-            parts.push(PartSpec::fixed(Shape::Ellipsoid { radii: Vec3::new(crown, crown, crown * 1.05) * 0.85 }, core, leaf(dice)));
+            parts.push(PartSpec::fixed(
+                Shape::Ellipsoid { radii: Vec3::new(crown, crown, crown * 1.05) * 0.85 },
+                core,
+                leaf(dice),
+            ));
             for k in 0..5 {
                 let angle = k as f32 * 1.257 + dice.range32(-0.4, 0.4);
                 let r = crown * dice.range32(0.45, 0.62);
-                let at = core + Vec3::new(angle.cos() * crown * 0.6, angle.sin() * crown * 0.6, dice.range32(-0.35, 0.45) * crown);
+                let at = core
+                    + Vec3::new(
+                        angle.cos() * crown * 0.6,
+                        angle.sin() * crown * 0.6,
+                        dice.range32(-0.35, 0.45) * crown,
+                    );
                 parts.push(PartSpec::fixed(Shape::Ellipsoid { radii: Vec3::new(r, r, r * 0.85) }, at, leaf(dice)));
             }
         }
@@ -103,7 +112,8 @@ fn sign(dice: &mut Dice) -> Vec<PartSpec> {
     let h = dice.range32(2.2, 2.9);
     let pole = Shape::Cylinder { radius: 0.035, half: 0.5 * h, hole: 0.0 };
     let (white, red, blue, yellow) = (rgb(235, 235, 235), rgb(190, 25, 30), rgb(25, 70, 165), rgb(240, 190, 30));
-    let (color, rim) = dice.pick(&[(white, red), (red, white), (blue, white), (yellow, rgb(20, 20, 20)), (white, blue)]);
+    let (color, rim) =
+        dice.pick(&[(white, red), (red, white), (blue, white), (yellow, rgb(20, 20, 20)), (white, blue)]);
     let round = dice.chance(0.5);
     let plate = Material::new(Surface::Sign { round }, color).accent(rim).seed(dice.next());
     let at = Vec3::new(-0.06, 0.0, h - 0.1);
@@ -132,7 +142,11 @@ fn lights(dice: &mut Dice) -> Vec<PartSpec> {
     ];
     if dice.chance(0.4) {
         let reach = dice.range32(3.0, 5.5);
-        parts.push(PartSpec::fixed(Shape::Cylinder { radius: 0.09, half: 2.9, hole: 0.0 }, Vec3::new(0.3, 0.0, 2.9), metal));
+        parts.push(PartSpec::fixed(
+            Shape::Cylinder { radius: 0.09, half: 2.9, hole: 0.0 },
+            Vec3::new(0.3, 0.0, 2.9),
+            metal,
+        ));
         parts.push(PartSpec::bar(Vec3::new(0.3, 0.0, 5.6), Vec3::new(0.3, -reach, 5.9), 0.06, metal));
         parts.push(PartSpec::fixed(Shape::cuboid(0.22, 0.34, 0.95), Vec3::new(0.1, -reach, 5.6), head));
     }
@@ -144,7 +158,11 @@ fn oddment(dice: &mut Dice) -> Vec<PartSpec> {
     let fixed = |shape, z: f32, m| PartSpec::fixed(shape, Vec3::new(0.0, 0.0, z), m);
     match dice.below(6) {
         0 => vec![fixed(Shape::Cylinder { radius: 0.25, half: 0.45, hole: 0.0 }, 0.45, metal(rgb(60, 80, 60)))],
-        1 => vec![fixed(Shape::cuboid(0.5, 0.45, 1.15), 0.57, metal(dice.pick(&[rgb(200, 40, 40), rgb(215, 180, 40), rgb(40, 70, 140)])))],
+        1 => vec![fixed(
+            Shape::cuboid(0.5, 0.45, 1.15),
+            0.57,
+            metal(dice.pick(&[rgb(200, 40, 40), rgb(215, 180, 40), rgb(40, 70, 140)])),
+        )],
         2 => {
             let wood = Material::new(Surface::Boards { step: 0.12 }, rgb(125, 90, 60));
             vec![
@@ -179,8 +197,18 @@ fn fence(dice: &mut Dice, town: &Town, length: f32) -> Vec<PartSpec> {
             let green = [rgb(80, 105, 50), rgb(55, 90, 45), rgb(120, 110, 50), rgb(75, 100, 60)][season];
             (dice.range32(0.8, 2.0), dice.range32(0.5, 0.9), Surface::Leaves, green * 0.8)
         }
-        1 => (dice.range32(0.6, 1.8), 0.25, Surface::Courses { step: 0.075 }, dice.pick(&[rgb(150, 85, 65), rgb(170, 160, 145)])),
-        2 => (dice.range32(0.9, 1.8), 0.06, Surface::Boards { step: 0.14 }, dice.pick(&[rgb(140, 105, 70), rgb(225, 225, 220), rgb(90, 75, 60)])),
+        1 => (
+            dice.range32(0.6, 1.8),
+            0.25,
+            Surface::Courses { step: 0.075 },
+            dice.pick(&[rgb(150, 85, 65), rgb(170, 160, 145)]),
+        ),
+        2 => (
+            dice.range32(0.9, 1.8),
+            0.06,
+            Surface::Boards { step: 0.14 },
+            dice.pick(&[rgb(140, 105, 70), rgb(225, 225, 220), rgb(90, 75, 60)]),
+        ),
         _ => {
             let metal = Material::new(Surface::Sheen, dice.pick(&[rgb(40, 45, 42), rgb(130, 132, 135)]));
             let mut parts = vec![
@@ -230,9 +258,10 @@ fn park(site: &mut Site, road: &Road, parked: &mut u32) {
             let lateral = side * (parking_lateral(road) + dice.range(-0.1, 0.15));
             let middle = at.pos + at.left() * lateral;
             // Other roads, a turning leg's for one, may cover this stretch.
-            let alone = site.layout.roads_near(site.leg, 1).all(|i| {
-                i == road.index || site.layout.roads[i].edge_distance(middle) > 0.5 * length + 2.0
-            });
+            let alone = site
+                .layout
+                .roads_near(site.leg, 1)
+                .all(|i| i == road.index || site.layout.roads[i].edge_distance(middle) > 0.5 * length + 2.0);
             if keep && clear && alone && *parked < ID_PARKED {
                 let yaw = at.heading + if forward { 0.0 } else { PI } + dice.range(-0.02, 0.02);
                 let origin = middle - DVec2::from_angle(yaw) * f64::from(model.middle());
@@ -301,7 +330,7 @@ fn row(site: &mut Site, road: &Road, side: f64) {
         let yaw = if side > 0.0 { at.heading } else { at.heading + PI };
         let beside = |d: f64| at.pos + at.left() * (side * (road.style.half_width + d));
         let pos = beside(0.6);
-        if k % 3 == 0 && lamps && site.beside_roads(pos, 0.4) {
+        if k.is_multiple_of(3) && lamps && site.beside_roads(pos, 0.4) {
             site.add(pos, yaw, lamp(&mut dice));
         } else if trees && dice.chance(0.85) {
             let pos = if road.style.district == Rural { beside(dice.range(2.0, 5.0)) } else { beside(0.8) };
@@ -347,7 +376,8 @@ fn gardens(site: &mut Site, road: &Road, side: f64) {
         }
         let count = (woods * dice.range(0.3, 1.7) * 1.5).round() as usize;
         for _ in 0..count {
-            let d = front + side * dice.range(1.5, if matches!(road.style.district, Park | Rural) { 45.0 } else { 14.0 });
+            let d =
+                front + side * dice.range(1.5, if matches!(road.style.district, Park | Rural) { 45.0 } else { 14.0 });
             let pos = road.path.at(s + dice.range(0.0, length)).pos + at.left() * d;
             let plot = Footprint { centre: pos, dir: DVec2::X, half: DVec2::splat(0.4) };
             if site.claim(plot, road.style.pavement + 0.8) {

@@ -53,9 +53,13 @@ pub(crate) fn look(m: &Material, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Loo
     match m.surface {
         Surface::Plain => Look::matt(m.color * (1.0 + 0.06 * grain(uv, 9.0, foot, m.seed))),
         Surface::Sheen => Look { albedo: m.color, gloss: 0.06, glow: Vec3::ZERO },
-        Surface::Rough => Look::matt(m.color * (1.0 + 0.3 * grain(uv, 12.0, foot, m.seed) + 0.15 * grain(uv, 4.0, foot, m.seed ^ 5))),
+        Surface::Rough => {
+            Look::matt(m.color * (1.0 + 0.3 * grain(uv, 12.0, foot, m.seed) + 0.15 * grain(uv, 4.0, foot, m.seed ^ 5)))
+        }
         Surface::Leaves => {
-            let clumps = 0.45 * grain(uv, 2.3, foot, m.seed) + 0.4 * grain(uv, 6.0, foot, m.seed ^ 9) + 0.25 * grain(uv, 14.0, foot, m.seed ^ 3);
+            let clumps = 0.45 * grain(uv, 2.3, foot, m.seed)
+                + 0.4 * grain(uv, 6.0, foot, m.seed ^ 9)
+                + 0.25 * grain(uv, 14.0, foot, m.seed ^ 3);
             // Darker towards the inside and below.
             let depth = 0.75 + 0.25 * (p.z / half.z);
             Look::matt(m.color * (depth * (1.0 + clumps)).max(0.15))
@@ -136,7 +140,8 @@ fn facade(m: &Material, f: &Facade, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> 
 }
 
 fn body(m: &Material, axles: [f32; 2], arch: f32, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Look {
-    let paint = Look { albedo: m.color * (1.0 + 0.03 * grain(face(p, n), 6.0, foot, m.seed)), gloss: 0.07, glow: Vec3::ZERO };
+    let paint =
+        Look { albedo: m.color * (1.0 + 0.03 * grain(face(p, n), 6.0, foot, m.seed)), gloss: 0.07, glow: Vec3::ZERO };
     let dark = Look { albedo: Vec3::splat(0.015), gloss: 0.03, glow: Vec3::ZERO };
     let up = (p.z + half.z) / (2.0 * half.z);
     let fz = foot / (2.0 * half.z);
@@ -193,7 +198,8 @@ fn cabin(m: &Material, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Look {
 }
 
 fn coach(m: &Material, from: f32, stripe: f32, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Look {
-    let paint = Look { albedo: m.color * (1.0 + 0.04 * grain(face(p, n), 2.0, foot, m.seed)), gloss: 0.05, glow: Vec3::ZERO };
+    let paint =
+        Look { albedo: m.color * (1.0 + 0.04 * grain(face(p, n), 2.0, foot, m.seed)), gloss: 0.05, glow: Vec3::ZERO };
     let up = (p.z + half.z) / (2.0 * half.z);
     let fz = foot / (2.0 * half.z);
     let mut look = paint;
@@ -213,7 +219,11 @@ fn coach(m: &Material, from: f32, stripe: f32, p: Vec3, n: Vec3, half: Vec3, foo
     }
     if from < 1.0 {
         let pane = band(up, from, 0.88, fz);
-        let (x, f, count) = if n.y.abs() > 0.5 { (p.x / half.x, foot / half.x, (half.x * 1.3).round().max(1.0)) } else { (p.y / half.y, foot / half.y, 1.0) };
+        let (x, f, count) = if n.y.abs() > 0.5 {
+            (p.x / half.x, foot / half.x, (half.x * 1.3).round().max(1.0))
+        } else {
+            (p.y / half.y, foot / half.y, 1.0)
+        };
         let posts = pulse((x * 0.5 + 0.5) * count, 0.05, 0.95, 0.5 * f * count);
         look = look.mix(glass(), pane * posts);
         if n.x > 0.5 {

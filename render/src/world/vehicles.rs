@@ -59,8 +59,11 @@ fn paint(dice: &mut Dice) -> Vec3 {
 impl VehicleModel {
     pub(crate) fn roll(dice: &mut Dice, big: f64) -> Self {
         use Build::{Bus, Hatchback, Lorry, Saloon, Suv, Van};
-        let build =
-            if dice.chance(big) { dice.pick(&[Van, Van, Lorry, Bus]) } else { dice.pick(&[Saloon, Saloon, Hatchback, Suv, Suv]) };
+        let build = if dice.chance(big) {
+            dice.pick(&[Van, Van, Lorry, Bus])
+        } else {
+            dice.pick(&[Saloon, Saloon, Hatchback, Suv, Suv])
+        };
         let (length, width, height, wheelbase, overhang, wheel) = match build {
             Saloon => (4.6, 1.82, 1.45, 2.75, 0.95, 0.32),
             Hatchback => (4.0, 1.75, 1.5, 2.55, 0.7, 0.31),
@@ -144,11 +147,18 @@ impl VehicleModel {
         ));
         let front = mid + 0.5 * l - 0.5 * nose;
         let belt = h * 0.52;
-        let hood = Shape::taper(nose, w * 0.99, belt - floor, Vec2::new(nose * 0.9, w * 0.95), Vec2::new(-nose * 0.05, 0.0));
+        let hood =
+            Shape::taper(nose, w * 0.99, belt - floor, Vec2::new(nose * 0.9, w * 0.95), Vec2::new(-nose * 0.05, 0.0));
         out.push(PartSpec::fixed(hood, Vec3::new(front, 0.0, 0.5 * (belt + floor)), {
             Material::new(Surface::Body { axles: [9.0, 9.0], arch: 0.0 }, self.paint).seed(self.seed)
         }));
-        let glass = Shape::taper(nose * 0.9, w * 0.93, h * 0.44, Vec2::new(nose * 0.12, w * 0.85), Vec2::new(-nose * 0.39, 0.0));
+        let glass = Shape::taper(
+            nose * 0.9,
+            w * 0.93,
+            h * 0.44,
+            Vec2::new(nose * 0.12, w * 0.85),
+            Vec2::new(-nose * 0.39, 0.0),
+        );
         let cabin = Material::new(Surface::Cabin, self.paint).seed(self.seed);
         out.push(PartSpec::fixed(glass, Vec3::new(front - nose * 0.05, 0.0, belt + h * 0.22), cabin));
     }
@@ -170,9 +180,8 @@ impl VehicleModel {
         let load = l - cab - 0.25;
         let mut dice = Dice::new(self.seed, &[1]);
         let cargo = paint(&mut dice);
-        let tarp = Material::new(Surface::Coach { glass: 1.0, stripe: 0.3 }, cargo)
-            .accent(paint(&mut dice))
-            .seed(self.seed);
+        let tarp =
+            Material::new(Surface::Coach { glass: 1.0, stripe: 0.3 }, cargo).accent(paint(&mut dice)).seed(self.seed);
         out.push(PartSpec::fixed(
             Shape::cuboid(load, w, h - 0.95),
             Vec3::new(mid - 0.5 * l + 0.5 * load, 0.0, 0.5 * (h + 0.95)),
