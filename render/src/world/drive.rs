@@ -104,7 +104,7 @@ impl Drive {
             options: options.clone(),
             springs: Springs::new(seed),
             sky: Sky::new(seed),
-            brightness: dice.range32(0.75, 1.1),
+            brightness: dice.range32(1.25, 1.9),
             layout,
             convoy,
             legs: LegStore::default(),

@@ -224,7 +224,7 @@ pub(crate) struct Springs {
 impl Springs {
     pub(crate) fn new(seed: u64) -> Self {
         let mut dice = Dice::new(seed, &[31]);
-        Self { phase: std::array::from_fn(|_| dice.range(0.0, 6.28)), size: dice.range(0.3, 1.2) }
+        Self { phase: std::array::from_fn(|_| dice.range(0.0, std::f64::consts::TAU)), size: dice.range(0.3, 1.2) }
     }
 
     /// local_from_base at a time.

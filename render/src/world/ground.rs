@@ -206,11 +206,13 @@ impl Strip {
             }
             (self.along(p), d)
         };
+        // Inside a road its strips end where the next begins; only the road's own ends are edges.
+        let free = if u < 0.5 * self.length { self.first } else { self.last };
         let out = (-u).max(u - self.length);
-        if out > SEAM_M && !(self.first && u < 0.0 || self.last && u > 0.0) {
+        if out > SEAM_M && !free {
             return None;
         }
-        let edge = (d.abs() - self.half_width).max(out - SEAM_M);
+        let edge = if free { (d.abs() - self.half_width).max(out) } else { d.abs() - self.half_width };
         (edge < BESIDE_M).then_some((edge, d))
     }
 

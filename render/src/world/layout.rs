@@ -31,8 +31,6 @@ pub(crate) struct Town {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Junction {
     pub pos: DVec2,
-    /// Arc length on the leg's road.
-    pub s: f64,
     /// Index of the crossing road.
     pub other: usize,
 }
@@ -119,7 +117,7 @@ impl Layout {
         path.push(before, 0.0);
         draft.core.pieces().iter().for_each(|p| path.push(p.length, p.curvature));
         path.push(after, 0.0);
-        self.roads.push(Road::new(self.town.seed, road, index, path, draft.style));
+        self.roads.push(Road::new(self.town.seed, road, path, draft.style));
         let mut junctions = Vec::new();
         let inner = draft.blocks.len().saturating_sub(1);
         for (b, (s, _)) in draft.blocks[..inner].iter().enumerate() {
@@ -137,12 +135,12 @@ impl Layout {
             path.push(arms[0] + arms[1], 0.0);
             let style = RoadStyle::side(&mut dice, &self.town, draft.style.district);
             let other = self.roads.len();
-            let mut side = Road::new(self.town.seed, other, index, path, style);
+            let mut side = Road::new(self.town.seed, other, path, style);
             side.add_junction(arms[0], draft.style.half_width, false, &mut dice);
             let s = s + before;
             self.roads[road].add_junction(s, style.half_width, true, &mut dice);
             self.roads.push(side);
-            junctions.push(Junction { pos: at.pos, s, other });
+            junctions.push(Junction { pos: at.pos, other });
         }
         self.legs.push(Leg { road, roads_end: self.roads.len(), junctions, lane: draft.lane, route_s: 0.0 });
     }
@@ -157,7 +155,7 @@ impl Layout {
             self.roads[ra].add_junction(sa, b.style.half_width, true, &mut dice);
             self.roads[rb].add_junction(sb, a.style.half_width, true, &mut dice);
             let pos = a.core.end().pos;
-            self.legs[i - 1].junctions.push(Junction { pos, s: sa, other: rb });
+            self.legs[i - 1].junctions.push(Junction { pos, other: rb });
         }
     }
 
@@ -235,7 +233,8 @@ impl Join {
         let tight = turn * town.hand < 0.0;
         let inner = |draft: &Draft| draft.style.half_width - draft.lane.abs();
         let radius = if tight {
-            town.corner + inner(a).min(inner(b))
+            // Never nearer to the rounded kerb than the nearer of the two lanes is to its own.
+            town.corner + inner(a).max(inner(b))
         } else {
             town.corner + a.style.half_width.min(b.style.half_width) + 1.5
         };
@@ -326,11 +325,10 @@ mod tests {
             let mut far = Vec::new();
             for k in 0..(route.length() / 2.0) as usize {
                 let p = route.at(k as f64 * 2.0).pos;
-                let on = layout
-                    .roads
-                    .iter()
-                    .any(|r| r.path.project(p).is_some_and(|(_, d)| d.abs() <= r.style.half_width - 0.9));
-                assert!(on, "seed {seed}: off the asphalt at {} m", 2 * k);
+                let s = 2.0 * k as f64;
+                let ground = crate::world::ground::Ground::new(&layout, layout.leg_at(s), p.extend(1.5));
+                let edge = ground.spot(glam::Vec2::ZERO).edge;
+                assert!(edge < -0.85, "seed {seed}: {edge} m from the asphalt's edge at {s} m");
                 if k % 10 == 0 {
                     far.push((k, p));
                 }

@@ -98,10 +98,11 @@ fn sample(tracer: &Tracer, col: usize, row: usize) -> Sample {
             flow = part.velocity(p).to_array();
         }
     }
-    Sample { label: hit.label(), depth: hit.depth(), flow, instance, color: tracer.color(u, v, &hit) }
+    let (color, lit) = tracer.color(u, v, &hit);
+    Sample { label: 2 * hit.label() + u32::from(lit), depth: hit.depth(), flow, instance, color }
 }
 
-/// Whether a neighbour shows another surface.
+/// Whether a neighbour shows another surface, or the border of a shadow runs between.
 fn on_edge(samples: &[Sample], width: usize, height: usize, col: usize, row: usize) -> bool {
     let i = row * width + col;
     let label = samples[i].label;
@@ -119,7 +120,7 @@ fn smoothed(tracer: &Tracer, col: usize, row: usize, centre: Vec3) -> Vec3 {
     for (du, dv) in EXTRA {
         let (u, v) = (col as f32 + 0.5 + du, row as f32 + 0.5 + dv);
         let hit = tracer.hit(u, v);
-        sum += cut(tracer.color(u, v, &hit));
+        sum += cut(tracer.color(u, v, &hit).0);
     }
     sum / (1 + EXTRA.len()) as f32
 }

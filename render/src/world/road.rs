@@ -72,9 +72,9 @@ impl RoadStyle {
         };
         let speed = match district {
             Suburb | Terraces => dice.range(7.0, 13.0),
-            Downtown | Park => dice.range(8.0, 15.0),
-            Industrial => dice.range(9.0, 16.0),
-            Rural => dice.range(12.0, 20.0),
+            Downtown | Park => dice.range(9.0, 17.0),
+            Industrial => dice.range(10.0, 19.0),
+            Rural => dice.range(13.0, 21.0),
         };
         let winding = if matches!(district, Rural | Park | Suburb) { 0.65 } else { 0.3 };
         Self::finish(dice, town, district, lanes, park, speed, winding)
@@ -133,16 +133,15 @@ pub(crate) struct Road {
     pub style: RoadStyle,
     pub crossings: Vec<Crossing>,
     pub seed: u64,
-    /// Index in the layout, and of the leg it belongs to.
+    /// Index in the layout.
     pub index: usize,
-    pub leg: usize,
     /// A circle around the centreline.
     pub centre: DVec2,
     pub radius: f64,
 }
 
 impl Road {
-    pub(crate) fn new(seed: u64, index: usize, leg: usize, path: Path, style: RoadStyle) -> Self {
+    pub(crate) fn new(seed: u64, index: usize, path: Path, style: RoadStyle) -> Self {
         let ends: Vec<DVec2> = path.pieces().iter().map(|p| p.start).chain(std::iter::once(path.end().pos)).collect();
         let (lo, hi) = ends.iter().fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(lo, hi), p| (lo.min(*p), hi.max(*p)));
         let centre = 0.5 * (lo + hi);
@@ -150,7 +149,7 @@ impl Road {
         let bulge = path.pieces().iter().filter(|p| p.curvature != 0.0).map(|p| 0.25 * p.length).fold(0.0, f64::max);
         let radius = 0.5 * (hi - lo).length() + bulge + style.half_width;
         let seed = fold(seed, &[20, index as u64]);
-        Self { path, style, crossings: Vec::new(), seed, index, leg, centre, radius }
+        Self { path, style, crossings: Vec::new(), seed, index, centre, radius }
     }
 
     pub(crate) fn add_junction(&mut self, s: f64, wide: f64, main: bool, dice: &mut Dice) {

@@ -5,7 +5,7 @@ use super::rig::DriveCamera;
 use glam::Vec3;
 
 /// Light at which the tone curve reaches white.
-const WHITE: f32 = 4.5;
+const WHITE: f32 = 4.0;
 /// Counts of the tone curve are looked up by the square root of light in this many steps.
 const STEPS: usize = 1024;
 
@@ -21,7 +21,7 @@ impl Sensor {
     pub(crate) fn new(camera: &DriveCamera, brightness: f32, noise: f32, key: [u64; 3]) -> Self {
         let gain = Vec3::from(camera.white_balance) * (camera.exposure_gain * brightness);
         // A gentle shoulder (extended Reinhard) and a display gamma.
-        let tone = |x: f32| (x * (1.0 + x / (WHITE * WHITE)) / (1.0 + x)).min(1.0).powf(1.0 / 2.2) * 255.0;
+        let tone = |x: f32| (x * (1.0 + x / (WHITE * WHITE)) / (1.0 + x)).min(1.0).powf(1.0 / 1.9) * 255.0;
         let top = WHITE.sqrt();
         let curve = (0..=STEPS + 1).map(|i| tone((i as f32 / STEPS as f32 * top).powi(2))).collect();
         Self { gain, noise, key: fold(key[0], &key[1..]), curve }

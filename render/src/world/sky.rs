@@ -30,7 +30,7 @@ impl Sky {
         let mut dice = Dice::new(seed, &[70]);
         let overcast = dice.chance(0.28);
         let height = if overcast { dice.range32(1.1, 1.4) } else { dice.range32(0.2, 1.15) };
-        let turn = dice.range32(-3.1416, 3.1416);
+        let turn = dice.range32(0.0, std::f32::consts::TAU);
         let sun = Vec3::new(turn.cos() * height.cos(), turn.sin() * height.cos(), height.sin());
         // The lower the sun, the warmer and weaker.
         let low = if overcast { 0.0 } else { (1.0 - height / 0.7).max(0.0) };
@@ -47,7 +47,7 @@ impl Sky {
         let above = if overcast {
             Vec3::new(0.8, 0.83, 0.88) * dice.range32(0.6, 0.95)
         } else {
-            Vec3::new(0.42, 0.5, 0.66) * bright * 0.8
+            Vec3::new(0.42, 0.5, 0.66) * bright * 0.62
         };
         let below = (0.25 * above + 0.12 * strength * warm * sun.z) * Vec3::new(0.9, 0.85, 0.75);
         Self {

@@ -142,8 +142,6 @@ pub(crate) struct Stream {
     /// Height of the ground walked on, and the stretches of the path that lie on asphalt instead.
     pub height: f64,
     pub dips: Vec<(f64, f64)>,
-    /// Offset to the left of the road's centreline, or, for those who cross it, none.
-    pub lateral: Option<f64>,
 }
 
 /// Length over which a pedestrian steps up or down a kerb.
@@ -304,7 +302,6 @@ mod tests {
                 ids: 8,
                 height: 0.12,
                 dips: vec![(10.0, 14.0)],
-                lateral: None,
             };
             let h = 1e-4;
             for k in 0..150 {

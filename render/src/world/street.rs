@@ -330,7 +330,7 @@ fn row(site: &mut Site, road: &Road, side: f64) {
         let yaw = if side > 0.0 { at.heading } else { at.heading + PI };
         let beside = |d: f64| at.pos + at.left() * (side * (road.style.half_width + d));
         let pos = beside(0.6);
-        if k % 3 == 0 && lamps && site.beside_roads(pos, 0.4) {
+        if k.is_multiple_of(3) && lamps && site.beside_roads(pos, 0.4) {
             site.add(pos, yaw, lamp(&mut dice));
         } else if trees && dice.chance(0.85) {
             let pos = if road.style.district == Rural { beside(dice.range(2.0, 5.0)) } else { beside(0.8) };

@@ -86,14 +86,14 @@ impl Tracer<'_> {
         if found == u32::MAX { Hit::Sky } else { Hit::Part { t, part: found, normal } }
     }
 
-    /// Light that comes back along the ray.
-    pub(crate) fn color(&self, u: f32, v: f32, hit: &Hit) -> Vec3 {
+    /// Light that comes back along the ray, and whether the sun shines on what it met.
+    pub(crate) fn color(&self, u: f32, v: f32, hit: &Hit) -> (Vec3, bool) {
         let d = self.view_from_camera * self.camera.ray(u, v);
         let length = d.length();
         let dir = d / length;
         let pixel = 1.0 / self.camera.fx;
         let (look, normal, t): (Look, Vec3, f32) = match hit {
-            Hit::Sky => return self.sky.color(dir),
+            Hit::Sky => return (self.sky.color(dir), false),
             Hit::Ground(hit) => (paint::look(&self.scene.ground, hit, d, pixel), hit.normal, hit.t),
             Hit::Part { t, part, normal } => {
                 let part = &self.scene.parts[*part as usize];
@@ -119,6 +119,6 @@ impl Tracer<'_> {
             let near_sun = mirror.dot(self.sky.sun).max(0.0).powi(4).powi(12);
             color += share * (shine - color).max(Vec3::ZERO) + self.sky.sun_color * (look.gloss * 4.0 * near_sun * lit);
         }
-        self.sky.through_air(color, t * length)
+        (self.sky.through_air(color, t * length), lit > 0.0)
     }
 }

@@ -13,10 +13,15 @@ use std::f64::consts::{PI, TAU};
 
 /// Instance numbers: the first few for the ego's companions, then one block per leg, which comes round after [`ID_LEGS`] legs.
 const ID_LEG_FIRST: u32 = 16;
-const ID_LEG: u32 = 1600;
-const ID_LEGS: u32 = 40;
+const ID_LEG: u32 = 2180;
+const ID_LEGS: u32 = 30;
+/// Numbers of one stream: more than fit into the 520 m a scene spans (on side roads: into their length).
 const ID_MAIN: u32 = 48;
 const ID_SIDE: u32 = 24;
+const ID_PEOPLE_MAIN: u32 = 120;
+const ID_PEOPLE_SIDE: u32 = 60;
+/// Pedestrians of one stream keep this far apart.
+const PEOPLE_APART_M: f64 = 4.8;
 /// Numbers for parked vehicles at the end of a leg's block.
 pub(crate) const ID_PARKED: u32 = 420;
 
@@ -79,7 +84,7 @@ fn meetings(along: &[Flow], stream: &Stream, pos: DVec2) -> Vec<GiveWay> {
     along.iter().enumerate().filter_map(meet).collect()
 }
 
-fn vehicles(dice: &mut Dice, layout: &Layout, path: Path, speed: f64, share: f64, lateral: f64) -> Stream {
+fn vehicles(dice: &mut Dice, layout: &Layout, path: Path, speed: f64, share: f64) -> Stream {
     let v = speed * dice.range(0.6, 1.05);
     // Half of the streams keep their speed, the others slow down and speed up again and again.
     let a = if dice.chance(0.5) { 0.0 } else { v * dice.range(0.2, 0.6) };
@@ -91,14 +96,13 @@ fn vehicles(dice: &mut Dice, layout: &Layout, path: Path, speed: f64, share: f64
         path,
         pace,
         // Far enough apart to keep a lorry's length and more between rear axles where the stream is slowest.
-        interval: (17.0 / (v - a)).max(2.4) * dice.range(1.34, 2.2),
+        interval: (17.0 / (v - a)).max(2.4) * dice.range(1.34, 1.8),
         share: share * layout.town.traffic,
         seed: dice.next(),
         id: 0,
         ids: 1,
         height: 0.0,
         dips: Vec::new(),
-        lateral: Some(lateral),
     }
 }
 
@@ -109,12 +113,12 @@ fn number(stream: Stream, id: &mut u32, ids: u32, streams: &mut Vec<Stream>) {
 
 fn busy(district: District) -> (f64, f64, f64) {
     match district {
-        District::Downtown => (0.75, 0.3, 0.7),
-        District::Terraces => (0.6, 0.3, 0.45),
-        District::Suburb => (0.5, 0.25, 0.3),
-        District::Park => (0.55, 0.4, 0.4),
-        District::Industrial => (0.65, 0.15, 0.15),
-        District::Rural => (0.5, 0.15, 0.05),
+        District::Downtown => (0.9, 0.45, 0.8),
+        District::Terraces => (0.85, 0.45, 0.6),
+        District::Suburb => (0.8, 0.4, 0.5),
+        District::Park => (0.8, 0.6, 0.6),
+        District::Industrial => (0.9, 0.3, 0.35),
+        District::Rural => (0.85, 0.35, 0.2),
     }
 }
 
@@ -132,12 +136,12 @@ fn main_streams(layout: &Layout, leg: &Leg, id: &mut u32, streams: &mut Vec<Stre
             }
             let path = road.path.offset(lateral);
             let path = if direction < 0.0 { path.reversed() } else { path };
-            number(vehicles(&mut dice, layout, path, style.speed, cars, lateral), id, ID_MAIN, streams);
+            number(vehicles(&mut dice, layout, path, style.speed, cars), id, ID_MAIN, streams);
         }
         let lateral = -hand * direction * (style.lanes as f64 * style.lane_width + 0.05);
         number(cyclists(&mut dice, layout, road, lateral, direction, bikes), id, ID_MAIN, streams);
     }
-    pedestrians(&mut dice, layout, road, people, id, ID_MAIN, streams);
+    pedestrians(&mut dice, layout, road, people, id, ID_PEOPLE_MAIN, streams);
 }
 
 fn side_streams(layout: &Layout, road: &Road, id: &mut u32, streams: &mut Vec<Stream>) {
@@ -151,9 +155,9 @@ fn side_streams(layout: &Layout, road: &Road, id: &mut u32, streams: &mut Vec<St
         // A road that ends at the junction has traffic that could only come out of it in a turn: none.
         let through = road.crossings.iter().all(|c| c.s > 1.0 && c.s < road.path.length() - 1.0);
         let share = if through { 0.9 * cars } else { 0.0 };
-        number(vehicles(&mut dice, layout, path, style.speed, share, lateral), id, ID_SIDE, streams);
+        number(vehicles(&mut dice, layout, path, style.speed, share), id, ID_SIDE, streams);
     }
-    pedestrians(&mut dice, layout, road, 0.6 * people, id, ID_SIDE, streams);
+    pedestrians(&mut dice, layout, road, 0.6 * people, id, ID_PEOPLE_SIDE, streams);
 }
 
 fn cyclists(dice: &mut Dice, layout: &Layout, road: &Road, lateral: f64, direction: f64, share: f64) -> Stream {
@@ -172,7 +176,6 @@ fn cyclists(dice: &mut Dice, layout: &Layout, road: &Road, lateral: f64, directi
         ids: 1,
         height: 0.0,
         dips: Vec::new(),
-        lateral: Some(lateral),
     }
 }
 
@@ -199,18 +202,18 @@ fn pedestrians(
                 Some((s - wide, s + wide))
             });
             let dips = dips.collect();
+            let v = dice.range(0.8, 1.9);
             let stream = Stream {
                 crowd: Crowd::Pedestrians,
                 path,
-                pace: Pace::steady(dice.range(0.8, 1.9)),
-                interval: dice.range(3.5, 9.0),
+                pace: Pace::steady(v),
+                interval: dice.range(1.0, 2.2) * PEOPLE_APART_M / v,
                 share: share * layout.town.traffic,
                 seed: dice.next(),
                 id: 0,
                 ids: 1,
                 height: layout.town.kerb,
                 dips,
-                lateral: Some(lateral),
             };
             number(stream, id, ids, streams);
         }
@@ -252,7 +255,6 @@ fn add_crossers(layout: &Layout, leg: &Leg, id: &mut u32, flows: &mut Vec<Flow>,
             ids: ID_SIDE,
             height: layout.town.kerb,
             dips: vec![(reach - wide, reach + wide)],
-            lateral: None,
         };
         *id += ID_SIDE;
         let mut gives_way = meetings(&flows[..along], &stream, at.pos);
@@ -327,7 +329,7 @@ impl Convoy {
         let mut dice = Dice::new(seed, &[45]);
         let mut companions = Vec::new();
         for sign in [1.0, -1.0] {
-            let count = if dice.chance((0.6 * traffic).min(0.9)) { 1 + dice.below(3) } else { 0 };
+            let count = if dice.chance((0.7 * traffic).min(0.95)) { 1 + dice.below(3) } else { 0 };
             let (mut ahead, mut gap) = (dice.range(0.5, 3.5), 0.0);
             for _ in 0..count {
                 let model = VehicleModel::roll(&mut dice, 0.2);
