@@ -1,6 +1,6 @@
 //! The street plan: legs (the roads the ego drives along, from turn to turn), the side roads that cross them, and the route.
 //!
-//! Turns alternate so that the nominal heading never leaves the half-plane ahead: the route cannot meet itself, however long.
+//! Turns alternate between left and right, so that the route climbs like a staircase: it cannot meet itself, however long.
 
 use super::dice::Dice;
 use super::path::Path;
@@ -255,6 +255,7 @@ fn draft_legs(town: &Town, length: f64) -> Vec<Draft> {
     let mut drafts: Vec<Draft> = Vec::new();
     let mut dice = Dice::new(town.seed, &[10]);
     let base = dice.range(-PI, PI);
+    let staircase = dice.sign() as i32;
     let (mut nominal, mut start, mut heading) = (0i32, DVec2::ZERO, base);
     let mut total = 0.0;
     let mut back_stub = STUB_M + 120.0;
@@ -270,7 +271,9 @@ fn draft_legs(town: &Town, length: f64) -> Vec<Draft> {
             let off = wrap(core.end().heading - nominal_heading);
             if dice.chance(style.winding) {
                 let side = if off.abs() > 0.15 { -off.signum() } else { dice.sign() };
-                let angle = dice.range(0.12, 0.6);
+                // Bends take the road off its nominal heading and then back to it.
+                let angle =
+                    if off.abs() > 0.15 { (off.abs() + dice.range(-0.1, 0.1)).min(0.6) } else { dice.range(0.12, 0.5) };
                 let radius = dice.range(45.0, 180.0);
                 core.push(APPROACH_M + dice.range(0.0, 30.0), 0.0);
                 core.push(radius * angle, side / radius);
@@ -280,11 +283,12 @@ fn draft_legs(town: &Town, length: f64) -> Vec<Draft> {
             }
             blocks.push((core.length(), core.pieces().len()));
         }
-        // At a heading of +-90 degrees the only way is back; ahead both are open.
-        let turn = if nominal == 0 { dice.sign() as i32 } else { -nominal };
-        nominal += turn;
-        let next = base + f64::from(nominal) * FRAC_PI_2 + dice.range(-0.12, 0.12);
+        // To one side and back, always the same: headings stay within a right angle of the diagonal between (bends included).
+        let turn = if nominal == 0 { staircase } else { -nominal };
         let end = core.end();
+        let off = wrap(end.heading - base - f64::from(nominal) * FRAC_PI_2);
+        nominal += turn;
+        let next = end.heading + f64::from(turn) * FRAC_PI_2 - 0.3 * off + dice.range(-0.1, 0.1);
         total += core.length();
         let ahead = if dice.chance(0.3) { 0.0 } else { STUB_M };
         // In a T the leg's road ends at the middle of the next one, or begins there.
@@ -327,15 +331,24 @@ mod tests {
                 let p = route.at(k as f64 * 2.0).pos;
                 let s = 2.0 * k as f64;
                 let ground = crate::world::ground::Ground::new(&layout, layout.leg_at(s), p.extend(1.5));
-                let edge = ground.spot(glam::Vec2::ZERO).edge;
-                assert!(edge < -0.85, "seed {seed}: {edge} m from the asphalt's edge at {s} m");
+                // Inside the union of two roads `edge` is a bound only: look at a circle as wide as the ego instead.
+                for j in 0..24 {
+                    let p = glam::Vec2::from_angle(j as f32 * 0.2618) * 0.95;
+                    let edge = ground.spot(p).edge;
+                    assert!(edge < 0.0, "seed {seed}: a wheel is {edge} m off the asphalt at {s} m");
+                }
                 if k % 10 == 0 {
                     far.push((k, p));
                 }
             }
             for (i, (ka, a)) in far.iter().enumerate() {
                 for (kb, b) in &far[i + 1..] {
-                    assert!(kb - ka < 40 || a.distance(*b) > 30.0, "seed {seed}: the route comes back to itself");
+                    assert!(
+                        kb - ka < 40 || a.distance(*b) > 30.0,
+                        "seed {seed}: the route comes back to itself: {} m and {} m, {a} {b}",
+                        2 * ka,
+                        2 * kb
+                    );
                 }
             }
         }
