@@ -108,28 +108,30 @@ impl Kernel for Map<'_> {
 
     #[inline(always)]
     fn run<S: Simd, const MR: usize>(self) {
+        // A macro, not closures: a closure does not inherit the target features of the function around it, and when it is
+        // not inlined every intrinsic in it becomes a call.
+        macro_rules! map {
+            ($f:ident) => {{
+                let mut chunks = self.values.chunks_exact_mut(S::W);
+                for chunk in &mut chunks {
+                    // SAFETY: the chunk has exactly `W` floats.
+                    unsafe { S::store(chunk.as_mut_ptr(), $f::<S>(S::load(chunk.as_ptr()))) };
+                }
+                let rest = chunks.into_remainder();
+                let mut lanes = [0f32; 16];
+                lanes[..rest.len()].copy_from_slice(rest);
+                // SAFETY: no vector has more than 16 lanes.
+                unsafe { S::store(lanes.as_mut_ptr(), $f::<S>(S::load(lanes.as_ptr()))) };
+                rest.copy_from_slice(&lanes[..rest.len()]);
+            }};
+        }
         match self.function {
-            Function::Exp2 => map::<S>(self.values, |v| exp2::<S>(v)),
-            Function::Erf => map::<S>(self.values, |v| erf::<S>(v)),
-            Function::Gelu => map::<S>(self.values, |v| gelu::<S>(v)),
-            Function::Silu => map::<S>(self.values, |v| silu::<S>(v)),
+            Function::Exp2 => map!(exp2),
+            Function::Erf => map!(erf),
+            Function::Gelu => map!(gelu),
+            Function::Silu => map!(silu),
         }
     }
-}
-
-#[inline(always)]
-fn map<S: Simd>(values: &mut [f32], f: impl Fn(S::V) -> S::V) {
-    let mut chunks = values.chunks_exact_mut(S::W);
-    for chunk in &mut chunks {
-        // SAFETY: the chunk has exactly `W` floats.
-        unsafe { S::store(chunk.as_mut_ptr(), f(S::load(chunk.as_ptr()))) };
-    }
-    let rest = chunks.into_remainder();
-    let mut lanes = [0f32; 16];
-    lanes[..rest.len()].copy_from_slice(rest);
-    // SAFETY: no vector has more than 16 lanes.
-    unsafe { S::store(lanes.as_mut_ptr(), f(S::load(lanes.as_ptr()))) };
-    rest.copy_from_slice(&lanes[..rest.len()]);
 }
 
 /// Applies `function` in place, on this thread.
