@@ -125,13 +125,16 @@ fn a_quaternion_far_from_unit_is_refused() {
 
 #[test]
 fn an_image_that_lies_about_its_size_is_refused() {
-    let image = |i: usize, m: &mut storm_node::msg::Image| {
+    // Height and width follow the encapsulation (4 bytes), the stamp (8) and the 15-letter frame name (4 + 16).
+    const HEIGHT_AT: usize = 32;
+    let bytes = |i: usize, mut b: Vec<u8>| {
         if i == 6 {
-            (m.width, m.height, m.step) = (1_000_000, 100_000, 3_000_000);
+            b[HEIGHT_AT..HEIGHT_AT + 4].copy_from_slice(&100_000u32.to_le_bytes());
+            b[HEIGHT_AT + 4..HEIGHT_AT + 8].copy_from_slice(&1_000_000u32.to_le_bytes());
         }
-        true
+        b
     };
-    let r = run(Maker { image: Box::new(image), ..Maker::default() });
+    let r = run(Maker { bytes: Box::new(bytes), ..Maker::default() });
     assert_eq!(r.code, 3, "{}", r.stderr);
     r.says(&["/camera0/image", &stamp(6).to_string(), "1000000"]);
     // The other camera's picture of that set is left alone.
