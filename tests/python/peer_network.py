@@ -1,6 +1,6 @@
 """Times a PyTorch forward pass of the same shapes as `storm bench`: the peer our network is compared with.
 
-    python peer_network.py [--embed 768 --depth 12 --heads 12 --height 160 --width 240 --views 12 --runs 2]
+    python peer_network.py [--embed 768 --depth 12 --heads 12 --height 160 --width 240 --views 12 --runs 3]
 
 Random weights; images to Gaussians, velocities and motion weights (no rendering), fp32, eager, all cores.
 Prints one JSON line: seconds per run and peak memory.
@@ -44,7 +44,7 @@ class Norm2d(torch.nn.Module):
 
 def main():
     p = argparse.ArgumentParser()
-    for name, value in dict(embed=768, depth=12, heads=12, height=160, width=240, views=12, runs=2).items():
+    for name, value in dict(embed=768, depth=12, heads=12, height=160, width=240, views=12, runs=3).items():
         p.add_argument(f"--{name}", type=int, default=value)
     a = p.parse_args()
     torch.manual_seed(0)

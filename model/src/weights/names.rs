@@ -176,13 +176,20 @@ fn mask_decoder(specs: &mut Specs, config: &ModelConfig) {
             specs.mlp(&name, &[d, d, projected]);
         }
     }
-    let velocity = config.velocity_channels();
     if paper && m > 0 {
-        (0..m).for_each(|k| specs.mlp(&format!("motion_basis_decoders.{k}"), &[d, config.basis_hidden, velocity]));
+        (0..m).for_each(|k| basis_decoder(specs, config, &format!("motion_basis_decoders.{k}"), d));
     } else {
-        let inputs = if m > 0 { d } else { projected };
-        specs.mlp("motion_basis_decoder", &[inputs, config.basis_hidden, velocity]);
+        basis_decoder(specs, config, "motion_basis_decoder", if m > 0 { d } else { projected });
     }
+}
+
+/// Velocities start below a metre per second whatever `velocity_scale` is, so that an untrained scene hardly moves.
+fn basis_decoder(specs: &mut Specs, config: &ModelConfig, name: &str, inputs: usize) {
+    let (hidden, velocity) = (config.basis_hidden, config.velocity_channels());
+    specs.mlp(name, &[inputs, hidden]);
+    let std = (hidden as f64).sqrt().recip() / config.velocity_scale;
+    specs.add(format!("{name}.fc2.weight"), &[velocity, hidden], Init::Normal(std));
+    specs.add(format!("{name}.fc2.bias"), &[velocity], Init::Zeros);
 }
 
 #[cfg(test)]

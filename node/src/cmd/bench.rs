@@ -21,7 +21,7 @@ use crate::source::world::first_window;
 /// Drive whose pictures are used; held-out seeds start at 10,000.
 const BENCH_SEED: u64 = 424_242;
 /// Images drawn to time the drive.
-const WORLD_IMAGES: usize = 60;
+const WORLD_IMAGES: usize = 180;
 
 /// Arguments of `storm bench`.
 #[derive(Debug, clap::Args)]
