@@ -1,4 +1,5 @@
 //! Bad input gets a clear message and the right exit code, and everything readable is still processed.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
 #[path = "common/maker.rs"]

@@ -1,4 +1,5 @@
 //! What the README and the configuration file promise is what the program does.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
 

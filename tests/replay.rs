@@ -1,4 +1,5 @@
 //! The main job over procedural bags: results complete, the same every time, and as exact far from the origin as near it.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
 
@@ -75,6 +76,39 @@ fn cameras_that_fire_one_after_the_other_are_brought_together() {
     // Images after the last pose cannot be placed, everything else must be.
     assert!(code(&output) == 0 || m["dropped"]["no_pose"].as_u64().unwrap() <= 2, "{}", stderr(&output));
     assert!(m["steps"].as_u64().unwrap() >= 1, "{m}");
+}
+
+/// One camera and one timestep is the smallest window, six and ten the largest.
+#[test]
+fn any_number_of_cameras_and_timesteps() {
+    let dir = tempfile::tempdir().unwrap();
+    for (cameras, timesteps, stride) in [("1", "1", "0.5"), ("6", "2", "0.4"), ("2", "10", "0.1")] {
+        let name = format!("{cameras}x{timesteps}");
+        let (bag, out) = (dir.path().join(format!("bag{name}")), dir.path().join(&name));
+        synth(&bag, 8, "1.2", &["--cameras", cameras]);
+        let (steps, stride) = (format!("window.timesteps={timesteps}"), format!("window.stride_sec={stride}"));
+        let output = replay(&bag, &out, &["--set", &steps, "--set", &stride, "--set", "window.hop_sec=0.2"]);
+        assert_eq!(code(&output), 0, "{name}: {}", stderr(&output));
+        let m = metrics(&out);
+        assert!(m["steps"].as_u64().unwrap() >= 1, "{name}: {m}");
+        let gaussians = cameras.parse::<u64>().unwrap() * timesteps.parse::<u64>().unwrap() * 48 * 32;
+        assert_eq!(m["gaussians"].as_u64().unwrap(), gaussians, "{name}");
+    }
+}
+
+#[test]
+fn the_recorded_stereo_bags_are_replayed_whole() {
+    for (bag, frames, steps) in [("kitti_ramp_stereo", 51, 36), ("kitti_ramp_stereo_sqlite", 20, 5)] {
+        let Some(bag) = common::shared(&format!("bags/{bag}")) else { return };
+        let dir = tempfile::tempdir().unwrap();
+        let output = replay(&bag, dir.path(), &[]);
+        assert_eq!(code(&output), 0, "{}", stderr(&output));
+        let m = metrics(dir.path());
+        assert_eq!(m["frames_in"], frames);
+        assert!(m["steps"].as_u64().unwrap() >= steps, "{m}");
+        assert!(m["dropped"].as_object().unwrap().values().all(|n| n == 0), "{}", m["dropped"]);
+        assert_eq!(m["nonfinite"], 0);
+    }
 }
 
 #[test]

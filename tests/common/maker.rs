@@ -1,4 +1,5 @@
 //! Small hand-made bags whose messages a test can spoil one by one.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::path::Path;
 
@@ -9,6 +10,7 @@ use storm_node::msg::{CameraInfo, Header, Image, PoseStamped, TransformStamped};
 use storm_node::output::bag_writer::BagWriter;
 use storm_node::output::qos::Qos;
 use storm_node::rigid::Rigid;
+use storm_render::Intrinsics;
 
 /// Frames in a bag, 0.1 s apart.
 pub const FRAMES: usize = 20;
@@ -107,18 +109,9 @@ fn mount(camera: usize) -> TransformStamped {
 }
 
 fn info(camera: usize, frame: usize) -> CameraInfo {
-    let (f, cx, cy) = (60.0, 31.5, 23.5);
-    CameraInfo {
-        header: header(&format!("camera{camera}_optical"), frame),
-        width: SIZE.0,
-        height: SIZE.1,
-        distortion_model: "plumb_bob".into(),
-        d: vec![0.0; 5],
-        k: [f, 0.0, cx, 0.0, f, cy, 0.0, 0.0, 1.0],
-        r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p: [f, 0.0, cx, 0.0, 0.0, f, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-        ..CameraInfo::default()
-    }
+    let (width, height) = (SIZE.0 as usize, SIZE.1 as usize);
+    let intrinsics = Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 24.0, width, height };
+    CameraInfo::pinhole(&intrinsics, header(&format!("camera{camera}_optical"), frame))
 }
 
 fn image(camera: usize, frame: usize) -> Image {

@@ -1,5 +1,5 @@
 //! What the cross-room tests share: running the program, reading its results, making small bags.
-#![allow(dead_code)]
+#![allow(dead_code, clippy::unwrap_used, clippy::expect_used)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

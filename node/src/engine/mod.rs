@@ -118,7 +118,7 @@ impl Engine {
 
     /// How scenes of this network are drawn.
     pub fn raster_settings(&self) -> RasterSettings {
-        self.raster.settings().clone()
+        *self.raster.settings()
     }
 
     /// Name of the weights file, or [`UNTRAINED`].

@@ -67,7 +67,7 @@ fn the_bag_holds_what_the_drive_says() {
     let (drive, options) = (tiny(), SynthOptions::default());
     write(&drive, dir.path(), &options);
     let topics = read(dir.path());
-    let frames = drive.frame_count() as usize;
+    let frames = drive.frame_count();
     for camera in 0..2 {
         let spec = &drive.cameras()[camera];
         let images = &topics[&format!("/camera{camera}/image")];

@@ -89,7 +89,10 @@ mod tests {
     /// Opacity and scale go through a logarithm and back in f32.
     const RELATIVE_TOLERANCE: f32 = 2e-5;
 
-    fn cloud(rows: &[([f32; 3], [f32; 3], f32, [f32; 3], [f32; 4])]) -> PlyCloud {
+    /// Position, colour, opacity, scale, quaternion.
+    type Row = ([f32; 3], [f32; 3], f32, [f32; 3], [f32; 4]);
+
+    fn cloud(rows: &[Row]) -> PlyCloud {
         PlyCloud {
             positions: rows.iter().map(|r| r.0).collect(),
             colors01: rows.iter().map(|r| r.1).collect(),

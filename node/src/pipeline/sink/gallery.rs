@@ -58,7 +58,7 @@ impl Gallery {
 
     /// Shows it a step.
     pub fn offer(&mut self, step: &Arc<Step>) {
-        if self.limit == 0 || step.index % self.every != 0 {
+        if self.limit == 0 || !step.index.is_multiple_of(self.every) {
             return;
         }
         self.kept.push(step.clone());
