@@ -2,26 +2,32 @@
 
 use std::path::PathBuf;
 use std::process::Command;
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
 use serde::Serialize;
 use serde_json::json;
 use storm_model::scene::Want;
+use storm_render::raster::RasterSettings;
 use storm_render::world::{Drive, DriveOptions};
 use storm_render::{Intrinsics, View};
 
 use super::{Outcome, UsageError, progress_bar};
 use crate::config::{Config, ModelConfigSection};
+use crate::engine::score::{Scorer, Scores};
 use crate::engine::{Engine, ModelSource, views_of};
-use crate::pipeline::step::newest_time_sec;
+use crate::pipeline::step::{Step, newest_time_sec};
 use crate::pipeline::timing::{StageStats, Timings, peak_rss_mb, reset_peak_rss};
-use crate::source::world::first_window;
+use crate::source::world::{first_window, posed_set, truth_images};
 
 /// Drive whose pictures are used; held-out seeds start at 10,000.
 const BENCH_SEED: u64 = 424_242;
 /// Images drawn to time the drive.
 const WORLD_IMAGES: usize = 180;
+
+/// Held-out frames each network's scene is scored on.
+const SCORED_FRAMES: usize = 4;
 
 /// Arguments of `storm bench`.
 #[derive(Debug, clap::Args)]
@@ -57,6 +63,9 @@ struct Setting {
     step_ms: StageStats,
     stages_ms: std::collections::BTreeMap<String, StageStats>,
     peak_rss_mb: Option<f64>,
+    psnr: Option<f64>,
+    depth_rmse: Option<f64>,
+    epe3d: Option<f64>,
 }
 
 /// Measures and prints.
@@ -150,7 +159,7 @@ fn time_model(name: &str, runs: usize) -> Result<Setting> {
     let large = network.embed_dim >= 768;
     let (warm, runs) = if large { (0, 1) } else { (1, runs.max(1)) };
     let mut timings = Timings::default();
-    let mut gaussians = 0;
+    let mut last = None;
     for run in 0..warm + runs {
         let mut once = Timings::default();
         let start = Instant::now();
@@ -158,14 +167,19 @@ fn time_model(name: &str, runs: usize) -> Result<Setting> {
         let targets: Vec<(View, Option<usize>)> =
             views_of(&window.steps[window.steps.len() - 1], &window.map_from_anchor, &cameras);
         let want = Want { flow: true, motion: true };
-        once.time("render", || engine.render(&scene, &targets, newest_time_sec(&window), want))?;
+        let views = once.time("render", || engine.render(&scene, &targets, newest_time_sec(&window), want))?;
         once.add("step", start.elapsed().as_secs_f64() * 1e3);
-        gaussians = scene.gaussians.len();
+        last = Some((scene, views));
         if run >= warm {
             timings.merge(once);
         }
     }
     let stages_ms = timings.stats();
+    let peak_rss_mb = peak_rss_mb();
+    let (scene, views) = last.context("no run")?;
+    let gaussians = scene.gaussians.len();
+    let step = Step { index: 0, window, scene: Arc::new(scene), views, total_ms: 0.0 };
+    let scores = score(engine.raster_settings(), step, &drive, &cameras)?;
     Ok(Setting {
         model: name.into(),
         weights: engine.weights().into(),
@@ -177,8 +191,26 @@ fn time_model(name: &str, runs: usize) -> Result<Setting> {
         picture: [width, height],
         step_ms: stages_ms["step"].clone(),
         stages_ms,
-        peak_rss_mb: peak_rss_mb(),
+        peak_rss_mb,
+        psnr: scores.as_ref().and_then(|s| s.storm.psnr),
+        depth_rmse: scores.as_ref().and_then(|s| s.storm.depth_rmse),
+        epe3d: scores.as_ref().and_then(|s| s.storm.epe3d),
     })
+}
+
+/// The window's scene against the frames between its timesteps.
+fn score(settings: RasterSettings, step: Step, drive: &Drive, cameras: &[Intrinsics]) -> Result<Option<Scores>> {
+    let mut scorer = Scorer::new(settings, cameras.to_vec(), SCORED_FRAMES)?;
+    for frame in 0..drive.frame_count() {
+        let (set, truth) = posed_set(drive, frame);
+        for (camera, t) in truth.into_iter().enumerate() {
+            let stamp_ns = set.frames[camera].stamp_ns;
+            truth_images(t).into_iter().for_each(|(kind, image)| scorer.truth(camera, stamp_ns, kind, image));
+        }
+        scorer.set(Arc::new(set));
+    }
+    scorer.step(Arc::new(step))?;
+    scorer.finish()
 }
 
 fn time_peer(python: &PathBuf) -> Result<serde_json::Value> {

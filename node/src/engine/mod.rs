@@ -16,7 +16,7 @@ use storm_render::{Intrinsics, View};
 use crate::config::ModelConfigSection;
 use crate::rigid::Rigid;
 use crate::source::Frame;
-use crate::window::{PosedSet, Window};
+use crate::window::{PosedSet, Window, relative};
 
 /// How the weights a run used are called in metrics.json and the report when there are none.
 pub const UNTRAINED: &str = "untrained";
@@ -138,7 +138,7 @@ impl Engine {
                 let view = |c: usize| ViewInput {
                     rgb: &pictures[t][c],
                     intrinsics: cameras[c],
-                    world_from_camera: window.anchor_from_camera(t, c).to_f32(),
+                    world_from_camera: window.anchor_from_camera(t, c).snapped().to_f32(),
                     time_sec: window.time_sec[t][c] as f32,
                 };
                 (0..cameras.len().min(pictures[t].len())).map(view).collect()
@@ -167,9 +167,8 @@ fn network_colors(rgb: &[u8]) -> Vec<f32> {
 
 /// The views of a set's cameras in the window's anchor frame, with their exposure's index.
 pub fn views_of(set: &PosedSet<Frame>, map_from_anchor: &Rigid, cameras: &[Intrinsics]) -> Vec<(View, Option<usize>)> {
-    let anchor_from_map = map_from_anchor.inverse();
     let view = |camera: usize| {
-        let pose = (anchor_from_map * set.frames[camera].map_from_camera).to_f32();
+        let pose = relative(map_from_anchor, &set.frames[camera].map_from_camera).snapped().to_f32();
         (View::from_pose(pose, cameras[camera]), Some(camera))
     };
     (0..cameras.len().min(set.frames.len())).map(view).collect()

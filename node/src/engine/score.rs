@@ -15,9 +15,9 @@ use storm_render::raster::{CpuRasterizer, RasterSettings};
 use crate::engine::views_of;
 use crate::pipeline::front::TruthImage;
 use crate::pipeline::step::Step;
+use crate::source::Frame;
 use crate::source::event::Truth;
 use crate::source::topics::TruthKind;
-use crate::source::{Frame, Rig};
 use crate::window::PosedSet;
 
 /// Sets and ground truth are kept this long beyond the oldest window that still waits to be scored, seconds.
@@ -150,10 +150,10 @@ pub struct Scorer {
 
 impl Scorer {
     /// Draws with `settings`, at most `frames_per_step` held-out sets per step.
-    pub fn new(settings: RasterSettings, rig: &Rig, frames_per_step: usize) -> Result<Self> {
+    pub fn new(settings: RasterSettings, cameras: Vec<Intrinsics>, frames_per_step: usize) -> Result<Self> {
         Ok(Self {
             raster: CpuRasterizer::new(settings)?,
-            cameras: rig.intrinsics(),
+            cameras,
             frames_per_step,
             sets: VecDeque::new(),
             truth: BTreeMap::new(),

@@ -125,7 +125,9 @@ impl VoxelMap {
         }
         let origin = *self.origin.get_or_insert(map_from_anchor.translation);
         let placed = Placed {
-            origin_from_anchor: map_from_anchor.translation - origin,
+            origin_from_anchor: Rigid::new(map_from_anchor.rotation, map_from_anchor.translation - origin)
+                .snapped()
+                .translation,
             turn: map_from_anchor.matrix3(),
             rotation: map_from_anchor.rotation.as_quat(),
             voxel_m: self.voxel_m,

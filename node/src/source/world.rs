@@ -10,6 +10,9 @@ use crate::rigid::Rigid;
 use crate::window::{PosedFrame, PosedSet, Window, WindowBuilder};
 
 use super::Frame;
+use super::event::Truth;
+use super::topics::TruthKind;
+use crate::pipeline::front::TruthImage;
 
 /// All cameras of `drive` at frame `frame`, posed, at the drive's own picture size; and the same with ground truth.
 pub fn posed_set(drive: &Drive, frame: usize) -> (PosedSet<Frame>, Vec<WorldFrame>) {
@@ -28,6 +31,19 @@ pub fn posed_set(drive: &Drive, frame: usize) -> (PosedSet<Frame>, Vec<WorldFram
     }
     let stamp_ns = frames.first().map_or(0, |f| f.stamp_ns);
     (PosedSet { stamp_ns, epoch: 0, frames }, truth)
+}
+
+/// A drawn frame's ground truth as the scorer takes it.
+pub fn truth_images(frame: WorldFrame) -> [(TruthKind, TruthImage); 4] {
+    let WorldFrame { width, height, depth, flow, sky, moving, .. } = frame;
+    let image = |data| TruthImage { width, height, data: Arc::new(data) };
+    let mask = |m: Vec<u8>| Truth::Mask(m.into_iter().map(u16::from).collect());
+    [
+        (TruthKind::Depth, image(Truth::Depth(depth))),
+        (TruthKind::Flow, image(Truth::Flow(flow))),
+        (TruthKind::Moving, image(mask(moving))),
+        (TruthKind::Sky, image(mask(sky))),
+    ]
 }
 
 /// The first window a drive gives, anchored at camera `reference`; `None` when the drive is too short for one.

@@ -76,7 +76,7 @@ impl Sink {
             false => None,
         };
         let scorer = match config.output.score_held_out {
-            true => Some(Scorer::new(engine.raster_settings(), rig, config.output.score_frames_per_step)?),
+            true => Some(Scorer::new(engine.raster_settings(), rig.intrinsics(), config.output.score_frames_per_step)?),
             false => None,
         };
         Ok(Self {
