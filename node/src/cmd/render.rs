@@ -20,7 +20,7 @@ const FULL_SPEED_MPS: f32 = 15.0;
 /// Arguments of `storm render`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// A map (map.ply), or a results folder with outputs.mcap (then --step picks the step).
+    /// A map (map.ply), or a results folder: its map, or with --step one of its steps.
     map: PathBuf,
     /// Camera pose in the map frame: X,Y,Z,YAW[,PITCH] (m, degrees; yaw 0 looks along x, pitch up is positive), or X,Y,Z,QW,QX,QY,QZ
     /// of a body with x forward, y left, z up.
@@ -29,7 +29,7 @@ pub struct Args {
     /// Picture to write (PNG).
     #[arg(long)]
     out: PathBuf,
-    /// Step of a results folder; the last one when not given.
+    /// Draw this step's Gaussians (from outputs.mcap, numbered from 0) instead of the map.
     #[arg(long)]
     step: Option<usize>,
     /// Seconds after the step's stamp; Gaussians move with their velocities. Negative looks back.

@@ -15,7 +15,7 @@ pub struct Args {
     #[arg(long)]
     seed: u64,
     /// Length, seconds.
-    #[arg(long)]
+    #[arg(long, allow_hyphen_values = true)]
     seconds: f64,
     /// Folder to write (an MCAP bag with its metadata.yaml).
     #[arg(long)]
