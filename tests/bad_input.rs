@@ -63,6 +63,15 @@ fn an_unspoiled_bag_loses_nothing() {
 }
 
 #[test]
+fn poses_from_tf_give_the_same_map_as_poses_from_a_topic() {
+    let (topic, tf) = (run(Maker::default()), run(Maker { tf: true, ..Maker::default() }));
+    assert_eq!(tf.code, 0, "{}", tf.stderr);
+    let map = |r: &Run| std::fs::read(r.out.join("map.ply")).unwrap();
+    assert!(map(&topic) == map(&tf));
+    assert!(map(&tf).len() > 10_000, "the map is empty");
+}
+
+#[test]
 fn a_missing_camera_info_is_named() {
     let r = run(Maker { info: Box::new(|camera, _| camera != 1), ..Maker::default() });
     assert_eq!(r.code, 2, "{}", r.stderr);

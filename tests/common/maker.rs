@@ -32,6 +32,8 @@ pub struct Maker {
     pub image: Edit<Image>,
     /// The images' bytes as written.
     pub bytes: Box<dyn Fn(usize, Vec<u8>) -> Vec<u8>>,
+    /// Poses come as /tf instead of /odometry.
+    pub tf: bool,
     /// Vehicle poses.
     pub pose: Edit<PoseStamped>,
     /// CameraInfo, index: camera.
@@ -45,6 +47,7 @@ impl Default for Maker {
         Self {
             image: Box::new(|_, _| true),
             bytes: Box::new(|_, b| b),
+            tf: false,
             pose: Box::new(|_, _| true),
             info: Box::new(|_, _| true),
             mount: Box::new(|_, _| true),
@@ -57,7 +60,10 @@ impl Maker {
     pub fn write(&self, path: &Path) {
         let mut bag = BagWriter::create(path).unwrap();
         let tf = bag.topic("/tf_static", MessageType::TfMessage, Qos::Latched).unwrap();
-        let odometry = bag.topic("/odometry", MessageType::Odometry, Qos::Reliable).unwrap();
+        let poses = match self.tf {
+            true => bag.topic("/tf", MessageType::TfMessage, Qos::Reliable).unwrap(),
+            false => bag.topic("/odometry", MessageType::Odometry, Qos::Reliable).unwrap(),
+        };
         for camera in 0..2 {
             let mut t = mount(camera);
             if (self.mount)(camera, &mut t) {
@@ -67,7 +73,12 @@ impl Maker {
         for frame in 0..FRAMES {
             let mut p = pose(frame);
             if (self.pose)(frame, &mut p) {
-                bag.write(odometry, stamp(frame), &encode::encode_odometry(&p).unwrap()).unwrap();
+                let PoseStamped { header, child_frame_id, pose: transform } = p.clone();
+                let cdr = match self.tf {
+                    true => encode::encode_tf_message(&[TransformStamped { header, child_frame_id, transform }]),
+                    false => encode::encode_odometry(&p),
+                };
+                bag.write(poses, stamp(frame), &cdr.unwrap()).unwrap();
             }
             for camera in 0..2 {
                 let name = |what: &str| format!("/camera{camera}/{what}");

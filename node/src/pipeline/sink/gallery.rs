@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use glam::DVec3;
+use storm_model::scene::RenderedView;
 
 use crate::config::Config;
 use crate::engine::UNTRAINED;
@@ -21,7 +22,8 @@ use crate::output::tracks_csv::TrackRow;
 use crate::pipeline::metrics::Metrics;
 use crate::pipeline::step::Step;
 use crate::rigid::Rigid;
-use crate::source::Rig;
+use crate::source::{Frame, Rig};
+use crate::window::PosedSet;
 
 use super::topics::{motion_mask, surface_depth};
 
@@ -47,7 +49,17 @@ const FILES: [(&str, &str); 6] = [
 pub struct Gallery {
     limit: usize,
     every: u64,
-    kept: Vec<Arc<Step>>,
+    kept: Vec<Shown>,
+}
+
+/// What is kept of a step: its pictures, not its Gaussians.
+struct Shown {
+    index: u64,
+    stamp_ns: i64,
+    gaussians: usize,
+    total_ms: f64,
+    views: Vec<RenderedView>,
+    inputs: Arc<PosedSet<Frame>>,
 }
 
 impl Gallery {
@@ -57,11 +69,19 @@ impl Gallery {
     }
 
     /// Shows it a step.
-    pub fn offer(&mut self, step: &Arc<Step>) {
+    pub fn offer(&mut self, step: &Step) {
+        let Some(newest) = step.window.steps.last() else { return };
         if self.limit == 0 || !step.index.is_multiple_of(self.every) {
             return;
         }
-        self.kept.push(step.clone());
+        self.kept.push(Shown {
+            index: step.index,
+            stamp_ns: step.window.stamp_ns,
+            gaussians: step.scene.gaussians.len(),
+            total_ms: step.total_ms,
+            views: step.views.clone(),
+            inputs: newest.clone(),
+        });
         if self.kept.len() > 2 * self.limit {
             self.every *= 2;
             self.kept.retain(|s| s.index % self.every == 0);
@@ -69,7 +89,7 @@ impl Gallery {
     }
 
     /// `limit` of the kept steps, first and last among them.
-    fn chosen(&self) -> Vec<&Arc<Step>> {
+    fn chosen(&self) -> Vec<&Shown> {
         let n = self.kept.len();
         let want = self.limit.min(n);
         (0..want).filter_map(|i| self.kept.get(if want > 1 { i * (n - 1) / (want - 1) } else { 0 })).collect()
@@ -166,14 +186,13 @@ fn error_table(rows: &[(&str, &str, bool, [Option<f64>; 2])]) -> ErrorTable {
     }
 }
 
-fn report_step(step: &Step, rig: &Rig) -> Result<ReportStep> {
-    let newest = &step.window.steps[step.window.steps.len() - 1];
+fn report_step(step: &Shown, rig: &Rig) -> Result<ReportStep> {
     let depths: Vec<Vec<f32>> = step.views.iter().map(surface_depth).collect();
     let scale = DepthScale::fit(depths.iter().map(Vec::as_slice));
     let mut cameras = Vec::new();
     for (c, view) in step.views.iter().enumerate() {
         let (w, h) = (view.width, view.height);
-        let input = Picture::from_rgb8(w, h, &newest.frames[c].item.rgb.data)?;
+        let input = Picture::from_rgb8(w, h, &step.inputs.frames[c].item.rgb.data)?;
         let rendered = Picture::from_rgb8(w, h, &view.rgb8())?;
         let still = vec![[0.0; 3]; w * h];
         let flow = flow_picture(w, h, view.flow.as_deref().unwrap_or(&still), None, FULL_SPEED_MPS)?;
@@ -182,7 +201,7 @@ fn report_step(step: &Step, rig: &Rig) -> Result<ReportStep> {
         cameras.push(ReportCamera {
             name: rig.cameras[c].topic.clone(),
             panels: vec![
-                panel("input", format!("{} ns", newest.frames[c].stamp_ns), input),
+                panel("input", format!("{} ns", step.inputs.frames[c].stamp_ns), input),
                 panel("rendered", "the newest picture as the scene shows it".into(), rendered.clone()),
                 panel(
                     "depth",
@@ -198,8 +217,8 @@ fn report_step(step: &Step, rig: &Rig) -> Result<ReportStep> {
             ],
         });
     }
-    let note = format!("{} Gaussians, {:.0} ms", step.scene.gaussians.len(), step.total_ms);
-    Ok(ReportStep { index: step.index as usize, stamp_ns: step.window.stamp_ns, note, cameras })
+    let note = format!("{} Gaussians, {:.0} ms", step.gaussians, step.total_ms);
+    Ok(ReportStep { index: step.index as usize, stamp_ns: step.stamp_ns, note, cameras })
 }
 
 /// Everything relative to the map's origin, so that UTM coordinates draw as sharply as small ones.
