@@ -1,5 +1,6 @@
 //! One window in, one scene out: the network and the renderer behind plain values.
 
+pub mod evaluate;
 pub mod score;
 pub mod select;
 

@@ -11,6 +11,7 @@ use storm_model::metrics::image::{Held, Image, ImageScores};
 use storm_model::scene::Want;
 use storm_render::Intrinsics;
 use storm_render::raster::{CpuRasterizer, RasterSettings};
+use storm_render::world::WorldFrame;
 
 use crate::engine::views_of;
 use crate::pipeline::front::TruthImage;
@@ -46,6 +47,12 @@ pub struct Figures {
     pub acc10: Option<f64>,
     /// Mean angle between true and predicted flow of moving points, radians.
     pub theta: Option<f64>,
+    /// Foreground adjusted Rand index of the motion masks on context frames.
+    pub fg_ari: Option<f64>,
+    /// Intersection over union of moving pixels on context frames, 0 to 1.
+    pub moving_iou: Option<f64>,
+    /// Milliseconds per window.
+    pub ms: Option<f64>,
 }
 
 /// Error figures of a run.
@@ -60,22 +67,12 @@ pub struct Scores {
 }
 
 impl Scores {
-    /// Name, unit, higher is better, and both methods' values.
+    /// Name, unit, higher is better, and both methods' values; what neither has is left out.
     pub fn rows(&self) -> Vec<(&'static str, &'static str, bool, [Option<f64>; 2])> {
-        let (a, b) = (&self.storm, &self.nearest_context);
-        let rows = vec![
-            ("PSNR", "dB", true, [a.psnr, b.psnr]),
-            ("PSNR, moving", "dB", true, [a.psnr_dynamic, b.psnr_dynamic]),
-            ("SSIM", "", true, [a.ssim, b.ssim]),
-            ("SSIM, moving", "", true, [a.ssim_dynamic, b.ssim_dynamic]),
-            ("depth RMSE", "m", false, [a.depth_rmse, b.depth_rmse]),
-            ("depth RMSE, moving", "m", false, [a.depth_rmse_dynamic, b.depth_rmse_dynamic]),
-            ("EPE3D", "m/s", false, [a.epe3d, b.epe3d]),
-            ("Acc5", "", true, [a.acc5, b.acc5]),
-            ("Acc10", "", true, [a.acc10, b.acc10]),
-            ("angle", "rad", false, [a.theta, b.theta]),
-        ];
-        rows.into_iter().filter(|(_, _, _, v)| v.iter().any(Option::is_some)).collect()
+        let both = self.storm.rows().into_iter().zip(self.nearest_context.rows());
+        both.map(|((name, unit, a), (_, _, b))| (name, unit, !matches!(unit, "m" | "m/s" | "rad" | "ms"), [a, b]))
+            .filter(|(_, _, _, values)| values.iter().any(Option::is_some))
+            .collect()
     }
 
     /// One line for the terminal.
@@ -94,8 +91,27 @@ impl Scores {
 }
 
 impl Figures {
+    /// Name, unit and value of each.
+    pub fn rows(&self) -> [(&'static str, &'static str, Option<f64>); 13] {
+        [
+            ("PSNR", "dB", self.psnr),
+            ("PSNR, moving", "dB", self.psnr_dynamic),
+            ("SSIM", "", self.ssim),
+            ("SSIM, moving", "", self.ssim_dynamic),
+            ("depth RMSE", "m", self.depth_rmse),
+            ("depth RMSE, moving", "m", self.depth_rmse_dynamic),
+            ("EPE3D", "m/s", self.epe3d),
+            ("Acc5", "", self.acc5),
+            ("Acc10", "", self.acc10),
+            ("angle", "rad", self.theta),
+            ("foreground ARI", "", self.fg_ari),
+            ("moving IoU", "", self.moving_iou),
+            ("run time", "ms", self.ms),
+        ]
+    }
+
     /// Means over images, without sky where the sky is known.
-    fn of_images(scores: &[ImageScores]) -> Self {
+    pub(super) fn of_images(scores: &[ImageScores]) -> Self {
         let m = ImageScores::mean(scores);
         Self {
             psnr: m.psnr_occupied.or(m.psnr),
@@ -110,7 +126,7 @@ impl Figures {
 }
 
 /// Ground truth of one picture, at the picture's size.
-struct TruthAt {
+pub(super) struct TruthAt {
     size: (usize, usize),
     depth: Option<Vec<f32>>,
     flow: Option<Vec<[f32; 3]>>,
@@ -119,8 +135,20 @@ struct TruthAt {
 }
 
 impl TruthAt {
+    /// Of a drawn frame, at its own size.
+    pub(super) fn of_frame(frame: &WorldFrame) -> Self {
+        let mask = |m: &[u8]| Some(m.iter().map(|&x| u16::from(x)).collect());
+        Self {
+            size: (frame.width, frame.height),
+            depth: Some(frame.depth.clone()),
+            flow: None,
+            moving: mask(&frame.moving),
+            sky: mask(&frame.sky),
+        }
+    }
+
     /// Scores of a picture against what the camera saw; `depth` is the prediction, where the method has one.
-    fn compare(&self, pred01: &[f32], true01: &[f32], depth: Option<&[f32]>) -> Result<ImageScores> {
+    pub(super) fn compare(&self, pred01: &[f32], true01: &[f32], depth: Option<&[f32]>) -> Result<ImageScores> {
         let image = |values| Image { values, width: self.size.0, height: self.size.1, channels: 3 };
         let flags = |mask: &Option<Vec<u16>>| mask.as_ref().map(|m| m.iter().map(|&x| x != 0).collect::<Vec<bool>>());
         let (sky, dynamic) = (flags(&self.sky), flags(&self.moving));
@@ -297,7 +325,7 @@ fn nearest_context(step: &Step, camera: usize, stamp_ns: i64) -> Option<&[u8]> {
 }
 
 /// 8-bit values as 0 to 1.
-fn unit(bytes: &[u8]) -> Vec<f32> {
+pub(super) fn unit(bytes: &[u8]) -> Vec<f32> {
     bytes.iter().map(|&b| b as f32 / 255.0).collect()
 }
 
