@@ -131,6 +131,13 @@ fn a_saved_map_and_a_saved_step_can_be_drawn() {
         assert!(std::fs::read(&png).unwrap().starts_with(b"\x89PNG"));
         std::fs::remove_file(&png).unwrap();
     }
+    let trajectory = out.join("trajectory.tum");
+    let frames = dir.path().join("frames");
+    let args = ["render", folder, "--step", "1", "--trajectory", trajectory.to_str().unwrap(), "--what", "mask"];
+    let output =
+        common::storm(&[&args[..], &["--width", "96", "--height", "64", "--out", frames.to_str().unwrap()]].concat());
+    assert_eq!(code(&output), 0, "{}", stderr(&output));
+    assert_eq!(std::fs::read_dir(&frames).unwrap().count(), 17);
     let output = common::storm(&["render", folder, "--step", "999", "--pose", "0,0,0,0", "--out", target]);
     assert_eq!(code(&output), 2);
     assert!(stderr(&output).contains("999"), "{}", stderr(&output));

@@ -12,12 +12,18 @@ use crate::output::ply::{PlyCloud, read_ply};
 use crate::pipeline::sink::{ANCHOR_FRAME, PREFIX};
 use crate::rigid::Rigid;
 
+/// ROS data type codes of the columns read.
+const FLOAT32: u8 = 7;
+const UINT16: u8 = 4;
+
 /// Gaussians in a local frame, and where that frame lies.
 pub struct SavedGaussians {
     /// The Gaussians.
     pub cloud: PlyCloud,
     /// Their velocities, m/s; empty for a map.
     pub velocities: Vec<[f32; 3]>,
+    /// Their motion groups; empty for a map.
+    pub motion_ids: Vec<u16>,
     /// The local frame in the map frame.
     pub map_from_local: Rigid,
 }
@@ -26,7 +32,7 @@ pub struct SavedGaussians {
 pub fn load_ply(path: &Path) -> Result<SavedGaussians> {
     let file = read_ply(path)?;
     let map_from_local = Rigid::new(DQuat::IDENTITY, DVec3::from_array(file.origin_m));
-    Ok(SavedGaussians { cloud: file.cloud, velocities: Vec::new(), map_from_local })
+    Ok(SavedGaussians { cloud: file.cloud, velocities: Vec::new(), motion_ids: Vec::new(), map_from_local })
 }
 
 /// Reads one step's Gaussians from `outputs.mcap`; the last step when `step` is not given.
@@ -46,8 +52,7 @@ pub fn load_step(path: &Path, step: Option<usize>) -> Result<SavedGaussians> {
         Some(tf) => anchor_at(&bag, tf, cloud.header.stamp_ns)?,
         None => bail!("{} has no /tf, so nobody knows where {ANCHOR_FRAME} was", path.display()),
     };
-    let (gaussians, velocities) = columns(&cloud)?;
-    Ok(SavedGaussians { cloud: gaussians, velocities, map_from_local })
+    columns(&cloud, map_from_local)
 }
 
 fn anchor_at(bag: &Bag, tf: usize, stamp_ns: i64) -> Result<Rigid> {
@@ -61,26 +66,27 @@ fn anchor_at(bag: &Bag, tf: usize, stamp_ns: i64) -> Result<Rigid> {
     bail!("no transform of {ANCHOR_FRAME} at {stamp_ns} ns")
 }
 
-/// The float columns of a Gaussian cloud by name.
-fn columns(cloud: &PointCloud2) -> Result<(PlyCloud, Vec<[f32; 3]>)> {
+/// The columns of a Gaussian cloud by name.
+fn columns(cloud: &PointCloud2, map_from_local: Rigid) -> Result<SavedGaussians> {
     let n = cloud.width as usize * cloud.height as usize;
     let step = cloud.point_step as usize;
     if step == 0 || cloud.data.len() < n.saturating_mul(step) {
         bail!("cloud of {n} points of {step} bytes has {} bytes", cloud.data.len());
     }
-    let offset = |name: &str| -> Result<usize> {
-        let field = cloud.fields.iter().find(|f| f.name == name && f.datatype == 7);
-        let field = field.with_context(|| format!("cloud has no float column {name}"))?;
-        let end = field.offset as usize + 4;
+    let offset = |name: &str, datatype: u8, bytes: usize| -> Result<usize> {
+        let field = cloud.fields.iter().find(|f| f.name == name && f.datatype == datatype);
+        let field = field.with_context(|| format!("cloud has no column {name} of type {datatype}"))?;
+        let end = field.offset as usize + bytes;
         if end <= step { Ok(field.offset as usize) } else { bail!("column {name} ends at byte {end} of {step}") }
     };
     let at = |point: &[u8], o: usize| f32::from_le_bytes([point[o], point[o + 1], point[o + 2], point[o + 3]]);
     let mut offsets = Vec::new();
     let names = "x y z rgb vx vy vz opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
     for name in names.split(' ') {
-        offsets.push(offset(name)?);
+        offsets.push(offset(name, FLOAT32, 4)?);
     }
-    let (mut out, mut velocities) = (PlyCloud::default(), Vec::with_capacity(n));
+    let group = offset("motion_id", UINT16, 2)?;
+    let (mut out, mut velocities, mut motion_ids) = (PlyCloud::default(), Vec::with_capacity(n), Vec::with_capacity(n));
     for point in cloud.data.chunks_exact(step).take(n) {
         let v: Vec<f32> = offsets.iter().map(|&o| at(point, o)).collect();
         let bytes = v[3].to_bits().to_le_bytes();
@@ -90,6 +96,7 @@ fn columns(cloud: &PointCloud2) -> Result<(PlyCloud, Vec<[f32; 3]>)> {
         out.opacities.push(v[7]);
         out.scales.push([v[8], v[9], v[10]]);
         out.quats.push([v[11], v[12], v[13], v[14]]);
+        motion_ids.push(u16::from_le_bytes([point[group], point[group + 1]]));
     }
-    Ok((out, velocities))
+    Ok(SavedGaussians { cloud: out, velocities, motion_ids, map_from_local })
 }

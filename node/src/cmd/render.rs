@@ -3,12 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use glam::{DQuat, DVec3, EulerRot};
+use glam::{DQuat, DVec3, EulerRot, Vec3};
 use storm_render::raster::{CpuRasterizer, Picture as RasterPicture, RasterSettings, Splats};
 use storm_render::{Intrinsics, View};
 
 use super::{Outcome, UsageError};
-use crate::output::picture::{DepthScale, Picture, depth_picture, flow_picture, with_depth_bar, with_flow_wheel};
+use crate::engine::select::MOVING_MPS;
+use crate::output::picture::{
+    DepthScale, Picture, depth_picture, flow_picture, mask_overlay, with_depth_bar, with_flow_wheel,
+};
+use crate::output::tum::read_tum;
 use crate::rigid::Rigid;
 use crate::saved::{self, SavedGaussians};
 
@@ -24,9 +28,15 @@ pub struct Args {
     map: PathBuf,
     /// Camera pose in the map frame: X,Y,Z,YAW[,PITCH] (m, degrees; yaw 0 looks along x, pitch up is positive), or X,Y,Z,QW,QX,QY,QZ
     /// of a body with x forward, y left, z up.
-    #[arg(long, allow_hyphen_values = true, value_parser = parse_pose)]
-    pose: Rigid,
-    /// Picture to write (PNG).
+    #[arg(long, allow_hyphen_values = true, value_parser = parse_pose, required_unless_present = "trajectory")]
+    pose: Option<Rigid>,
+    /// Draw from every pose of a TUM file instead (timestamp x y z qx qy qz qw, such as a results folder's trajectory.tum).
+    #[arg(long, conflicts_with = "pose")]
+    trajectory: Option<PathBuf>,
+    /// Height of the camera above the poses of --trajectory, metres.
+    #[arg(long, default_value_t = 1.6, allow_hyphen_values = true)]
+    height_m: f64,
+    /// Picture to write (PNG); with --trajectory a folder for 000000.png, 000001.png, ...
     #[arg(long)]
     out: PathBuf,
     /// Draw this step's Gaussians (from outputs.mcap, numbered from 0) instead of the map.
@@ -35,7 +45,7 @@ pub struct Args {
     /// Seconds after the step's stamp; Gaussians move with their velocities. Negative looks back.
     #[arg(long, default_value_t = 0.0, allow_hyphen_values = true)]
     time: f32,
-    /// What to draw: color, depth or flow.
+    /// What to draw.
     #[arg(long, default_value = "color")]
     what: What,
     /// Picture width, pixels.
@@ -51,9 +61,14 @@ pub struct Args {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum What {
+    /// Colours.
     Color,
+    /// z-depth with a colour bar.
     Depth,
+    /// Velocity with its wheel.
     Flow,
+    /// Motion groups over the colours.
+    Mask,
 }
 
 fn parse_pose(text: &str) -> Result<Rigid, String> {
@@ -77,20 +92,32 @@ pub fn run(args: &Args) -> Result<Outcome> {
         return Err(UsageError(format!("--fov {}: wants 1 to 170 degrees", args.fov)).into());
     }
     let saved = load(&args.map, args.step)?;
-    let body_from_camera = crate::window::camera_from_flu().inverse();
-    let local_from_camera = saved.map_from_local.inverse() * args.pose * body_from_camera;
     let intrinsics = Intrinsics::from_fov(args.fov, args.width, args.height);
-    let view = View::from_pose(local_from_camera.to_f32(), intrinsics);
-    let picture = draw(&saved, &view, args.time)?;
-    if !picture.alpha.iter().any(|&a| a > 0.0) {
+    let mut raster = CpuRasterizer::new(RasterSettings::default())?;
+    let mut one = |pose: &Rigid, out: &Path| -> Result<bool> {
+        let local_from_camera = saved.map_from_local.inverse() * *pose * crate::window::camera_from_flu().inverse();
+        let view = View::from_pose(local_from_camera.to_f32(), intrinsics);
+        let picture = draw(&mut raster, &saved, &view, args.time)?;
+        finish(&picture, args.what)?.write_png(out).with_context(|| format!("cannot write {}", out.display()))?;
+        Ok(picture.alpha.iter().any(|&a| a > 0.0))
+    };
+    let mut seen = false;
+    if let Some(pose) = &args.pose {
+        seen = one(pose, &args.out)?;
+    }
+    if let Some(file) = &args.trajectory {
+        std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
+        let up = Rigid::new(DQuat::IDENTITY, DVec3::new(0.0, 0.0, args.height_m));
+        for (i, (_, pose)) in read_tum(file)?.iter().enumerate() {
+            seen |= one(&(*pose * up), &args.out.join(format!("{i:06}.png")))?;
+        }
+    }
+    if !seen {
         tracing::warn!(
             "nothing is in view from there; the map's own position is {:?}",
             saved.map_from_local.translation
         );
     }
-    finish(&picture, args.what)?
-        .write_png(&args.out)
-        .with_context(|| format!("cannot write {}", args.out.display()))?;
     println!("{}", args.out.display());
     Ok(Outcome::Done)
 }
@@ -106,35 +133,42 @@ fn load(path: &Path, step: Option<usize>) -> Result<SavedGaussians> {
     }
 }
 
-/// Colour and velocity channels, depth and coverage.
-fn draw(saved: &SavedGaussians, view: &View, time_sec: f32) -> Result<RasterPicture> {
+/// Channels in front of the motion groups': colour 3, velocity 3.
+const BASE_CHANNELS: usize = 6;
+
+/// Colour, velocity and one channel per motion group, depth and coverage.
+fn draw(raster: &mut CpuRasterizer, saved: &SavedGaussians, view: &View, time_sec: f32) -> Result<RasterPicture> {
     let cloud = &saved.cloud;
     let still = [0.0f32; 3];
     let velocity = |i: usize| saved.velocities.get(i).unwrap_or(&still);
     let move_by =
         |(i, p): (usize, &[f32; 3])| -> [f32; 3] { std::array::from_fn(|k| p[k] + time_sec * velocity(i)[k]) };
     let means: Vec<[f32; 3]> = cloud.positions.iter().enumerate().map(move_by).collect();
-    let features: Vec<f32> = cloud
-        .colors01
-        .iter()
-        .enumerate()
-        .flat_map(|(i, c)| c.iter().chain(velocity(i)).copied().collect::<Vec<_>>())
-        .collect();
+    let groups = saved.motion_ids.iter().max().map_or(0, |&m| usize::from(m) + 1);
+    let feature_count = BASE_CHANNELS + groups;
+    let mut features = vec![0.0; feature_count * cloud.len()];
+    for (i, row) in features.chunks_exact_mut(feature_count).enumerate() {
+        row[..3].copy_from_slice(&cloud.colors01[i]);
+        row[3..BASE_CHANNELS].copy_from_slice(velocity(i));
+        if let Some(&group) = saved.motion_ids.get(i) {
+            row[BASE_CHANNELS + usize::from(group)] = 1.0;
+        }
+    }
     let splats = Splats {
         means: &means,
         quats: &cloud.quats,
         scales: &cloud.scales,
         opacities: &cloud.opacities,
         features: &features,
-        feature_count: 6,
+        feature_count,
     };
-    let mut raster = CpuRasterizer::new(RasterSettings::default())?;
     raster.render(&splats, std::slice::from_ref(view))?.pop().context("the rasteriser gave no picture")
 }
 
 fn finish(p: &RasterPicture, what: What) -> Result<Picture> {
     let (w, h) = (p.width, p.height);
-    let channels = |from: usize| p.features.chunks_exact(6).map(move |f| [f[from], f[from + 1], f[from + 2]]);
+    let pixels = || p.features.chunks_exact(p.feature_count);
+    let channels = |from: usize| pixels().map(move |f| [f[from], f[from + 1], f[from + 2]]);
     Ok(match what {
         What::Color => Picture::from_rgb01(w, h, &channels(0).flatten().collect::<Vec<_>>())?,
         What::Depth => {
@@ -142,6 +176,16 @@ fn finish(p: &RasterPicture, what: What) -> Result<Picture> {
                 p.depth.iter().zip(&p.alpha).map(|(d, a)| if *a >= SURFACE_ALPHA { *d } else { 0.0 }).collect();
             let scale = DepthScale::fit([depth.as_slice()]);
             with_depth_bar(&depth_picture(w, h, &depth, scale)?, scale)
+        }
+        What::Mask => {
+            let group = |f: &[f32]| {
+                let moves = Vec3::new(f[3], f[4], f[5]).length() >= MOVING_MPS;
+                let first_largest = |best: usize, k: usize| if f[k] > f[best] { k } else { best };
+                let best = (BASE_CHANNELS..f.len()).fold(BASE_CHANNELS, first_largest);
+                if moves { (best - BASE_CHANNELS + 1) as u16 } else { 0 }
+            };
+            let ids: Vec<u16> = pixels().map(group).collect();
+            mask_overlay(&Picture::from_rgb01(w, h, &channels(0).flatten().collect::<Vec<_>>())?, &ids)?
         }
         What::Flow => {
             let flow: Vec<[f32; 3]> = channels(3).collect();
