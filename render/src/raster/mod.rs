@@ -1,12 +1,14 @@
-//! Splatting: forward rasterisation of 3D Gaussians on the CPU, by the rules of gsplat (see [`Convention`]).
+//! Splatting: rasterisation of 3D Gaussians on the CPU and its gradients, by the rules of gsplat (see [`Convention`]).
 //!
 //! The data's way: `scene` (checked input) -> `project` (ellipses of eight Gaussians at a time, for all views) ->
 //! `tiles` (each chunk lists its splats by tile) -> `sort` (depth order per tile) -> `blend` (front to back) ->
-//! [`Picture`]. [`reference`](mod@reference) is the slow, obvious version all of it is tested against.
+//! [`Picture`]; and back: [`PictureGradient`] -> `unblend` (back to front) -> `unproject` -> [`SplatGradients`], from
+//! there to velocities by [`VelocityGradients`]. [`reference`](mod@reference) is the slow, obvious version all of it is tested against.
 
 mod backward;
 mod blend;
 mod error;
+mod motion;
 mod project;
 pub mod reference;
 mod scene;
@@ -23,6 +25,7 @@ mod tests;
 
 pub use backward::{MAX_PAIR_SUMS, PictureGradient, SplatGradients};
 pub use error::RasterError;
+pub use motion::VelocityGradients;
 pub use scene::{MAX_FEATURES, MAX_PICTURE_VALUES, MAX_SIDE, MAX_SPLATS, MAX_VIEWS, Picture, RasterStats, Splats};
 use settings::ALPHA_FLOOR;
 pub use settings::{ALPHA_MIN, Convention, RasterSettings, TILE_RULE, TRANSMITTANCE_STOP};
@@ -43,7 +46,7 @@ const MIN_CHUNK_BITS: u32 = 12;
 /// Chunks grow with the number of Gaussians so that there are about this many at most.
 const MAX_CHUNKS: usize = 256;
 
-/// The forward rasteriser; owns its buffers, so that a stream of pictures allocates only once.
+/// The rasteriser; owns its buffers, so that a stream of pictures allocates only once.
 pub struct CpuRasterizer {
     settings: RasterSettings,
     isa: Isa,

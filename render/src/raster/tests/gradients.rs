@@ -13,9 +13,13 @@ use rand_chacha::ChaCha8Rng;
 const GOLDEN_TOLERANCE: f64 = 2e-5;
 /// Share of a tensor's largest entry below which numbers are rounding (a ball's orientation matters to nothing).
 const NOISE: f64 = 1e-9;
-/// Against central differences, as a share of the largest entry of the kind in the scene: f32 sums, differences'
-/// own second order and pixels where a step crosses the alpha cap.
-const DIFFERENCE_TOLERANCE: f64 = 2e-3;
+/// Against central differences, as a share of the largest entry of the kind in the scene: f32 sums, and the
+/// rounding of the expected depth over a faint pixel's alpha. Measured 3e-4 over 3000 scenes.
+const DIFFERENCE_TOLERANCE: f64 = 1e-3;
+/// Entries this small are sums over hundreds of pixels of random upstream up to 1 that have cancelled: not a scale.
+const DIFFERENCE_FLOOR: f64 = 0.1;
+/// Slopes over two step lengths that differ by more than this share of the largest entry belong to a jump.
+const JUMP: f32 = 1e-3;
 /// Between two f32 runs that add in another order.
 const ORDER_TOLERANCE: f64 = 1e-4;
 
@@ -151,44 +155,59 @@ fn compare_with_differences(settings: RasterSettings, scene: &Scene, views: &[Vi
     let parameters: [(usize, Parameter); 5] = [
         (3, |s, i, k| {
             let z = s.means[i][2].abs();
-            (&mut s.means[i][k], 1e-5 * z)
+            (&mut s.means[i][k], 4e-6 * z)
         }),
-        (4, |s, i, k| (&mut s.quats[i][k], 2e-5)),
+        (4, |s, i, k| (&mut s.quats[i][k], 4e-6)),
         (3, |s, i, k| {
             let size = s.scales[i].iter().fold(0.0f32, |a, &x| a.max(x));
-            (&mut s.scales[i][k], 2e-5 * size)
+            (&mut s.scales[i][k], 4e-6 * size)
         }),
-        (1, |s, i, _| (&mut s.opacities[i], 1e-5)),
+        (1, |s, i, _| {
+            // Not so far that a pixel crosses 1/255.
+            let opacity = s.opacities[i];
+            (&mut s.opacities[i], 4e-6 * opacity)
+        }),
         (scene.feature_count, |s, i, k| {
             let at = i * s.feature_count + k;
             (&mut s.features[at], 1e-3)
         }),
     ];
     for ((width, parameter), (name, got)) in parameters.into_iter().zip(tensors(&gradients)) {
-        let differences = (0..scene.means.len() * width).map(|at| {
+        let slope = |at: usize, share: f32| {
             let loss_at = |sign: f32| {
                 let mut moved = scene.clone();
                 let (value, step) = parameter(&mut moved, at / width, at % width);
-                *value += sign * step;
+                *value += sign * share * step;
                 let value = f64::from(*value);
                 (value, loss(&exact(&moved), &upstream))
             };
             let ((high, loss_high), (low, loss_low)) = (loss_at(1.0), loss_at(-1.0));
             ((loss_high - loss_low) / (high - low)) as f32
-        });
-        let want: Vec<f32> = differences.collect();
-        let (largest, rms) = errors(got, &want, 1e-30);
-        println!("{name}: largest {largest:.1e}, root of squares {rms:.1e} of {}", want.len());
+        };
+        let slopes = |share: f32| -> Vec<f32> { (0..scene.means.len() * width).map(|at| slope(at, share)).collect() };
+        let (want, check) = (slopes(1.0), slopes(0.25));
+        // A step across a jump (a near plane, a tile's edge) gives a slope that grows as the step shrinks.
+        let scale = check.iter().fold(0.0f32, |a, x| a.max(x.abs()));
+        let jumps: Vec<bool> = want.iter().zip(&check).map(|(a, b)| (a - b).abs() > JUMP * scale).collect();
+        let smooth = |values: &[f32]| -> Vec<f32> {
+            values.iter().zip(&jumps).filter(|(_, jump)| !**jump).map(|(value, _)| *value).collect()
+        };
+        let skipped = jumps.iter().filter(|j| **j).count();
+        assert!(skipped <= 1 + want.len() / 10, "{name}: {skipped} of {} entries have no slope", want.len());
+        let (got, want) = (smooth(got), smooth(&want));
+        let (largest, rms) = errors(&got, &want, DIFFERENCE_FLOOR);
+        println!("{name}: largest {largest:.1e}, root of squares {rms:.1e} of {}, {skipped} jump", want.len());
         assert!(largest <= DIFFERENCE_TOLERANCE, "{name}: {largest:e}\n got {got:?}\nwant {want:?}");
     }
 }
 
-/// Gaussians in front of the camera with opacities clear of the cap, where the loss has a corner.
+/// Gaussians in front of the camera with opacities clear of the cap, where the loss has a corner, and of 0: a scene of
+/// nothing but faint splats has no gradient to speak of but the rounding of the expected depth over its alpha.
 fn smooth_scene(seed: u64, n: usize, channels: usize) -> Scene {
     let mut scene = Scene::random(seed, n, channels);
     for (mean, opacity) in scene.means.iter_mut().zip(&mut scene.opacities) {
         mean[2] = mean[2].max(0.5);
-        *opacity = opacity.min(0.95);
+        *opacity = opacity.clamp(0.05, 0.95);
     }
     scene
 }
