@@ -60,8 +60,12 @@ fn check(case: &str, options: &RenderLossOptions, terms: &[(&str, &str)]) {
 
 #[test]
 fn the_papers_losses() {
-    let terms =
-        [("rgb", "rgb_loss"), ("depth", "depth_loss"), ("velocity", "flow_reg_loss"), ("sky_opacity", "sky_opacity_loss")];
+    let terms = [
+        ("rgb", "rgb_loss"),
+        ("depth", "depth_loss"),
+        ("velocity", "flow_reg_loss"),
+        ("sky_opacity", "sky_opacity_loss"),
+    ];
     check("pixel", &RenderLossOptions::default(), &terms);
 }
 
@@ -69,11 +73,7 @@ fn the_papers_losses() {
 fn the_sky_at_a_depth() {
     let options =
         RenderLossOptions { sky_opacity: 0.0, velocity: 0.0, sky_depth_m: Some(300.0), ..RenderLossOptions::default() };
-    let terms = [
-        ("rgb", "rgb_loss"),
-        ("depth", "depth_loss"),
-        ("sky_depth", "sky_depth_loss"),
-        ("opacity", "opacity_loss"),
-    ];
+    let terms =
+        [("rgb", "rgb_loss"), ("depth", "depth_loss"), ("sky_depth", "sky_depth_loss"), ("opacity", "opacity_loss")];
     check("skydepth_pixel", &options, &terms);
 }
