@@ -12,6 +12,7 @@ pub mod ops;
 pub mod plain;
 mod rays;
 pub mod scene;
+pub mod train;
 pub mod weights;
 
 pub use clip::{ClipBatch, PixelLayout, ViewInput};

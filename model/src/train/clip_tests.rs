@@ -1,0 +1,98 @@
+use std::sync::Arc;
+
+use candle_core::Tensor;
+use glam::Vec3;
+
+use super::clips::{ClipOptions, ClipPlan, HELD_OUT_SEEDS};
+use super::loader::{DataOptions, Loader};
+use crate::config::ModelConfig;
+
+fn small() -> ClipOptions {
+    ClipOptions { width: 24, height: 16, cameras: 3, targets: 2, ..ClipOptions::default() }
+}
+
+fn values(x: &Tensor) -> Vec<f32> {
+    x.flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Where surfaces seen twice may differ at most, metres over depth: half a pixel's footprint at this picture size, on
+/// surfaces seen at a slant.
+const SAME_SURFACE: f32 = 0.15;
+
+#[test]
+fn samples_depend_on_seed_and_index_only_and_leave_the_held_out_drives_alone() {
+    let options = small();
+    for index in 0..2000 {
+        let plan = ClipPlan::training(3, index, &options);
+        assert!(!HELD_OUT_SEEDS.contains(&plan.drive_seed));
+        assert!(plan.start_sec >= 0.0 && plan.start_sec + options.span_sec <= options.drive_sec);
+        assert!(plan.target_sec.iter().all(|&t| (0.0..options.span_sec).contains(&t)));
+        assert_eq!(plan, ClipPlan::training(3, index, &options));
+        assert_ne!(plan, ClipPlan::training(4, index, &options));
+        assert_ne!(plan.drive_seed, ClipPlan::training(3, index + 1, &options).drive_seed);
+    }
+}
+
+#[test]
+fn the_anchor_is_the_front_camera_and_static_points_agree_between_pictures() {
+    let options = ClipOptions { width: 48, height: 32, ..small() };
+    let clip = ClipPlan::of_drive(10_500, &options).make(&options, &ModelConfig::preset("tiny").unwrap()).unwrap();
+    let pose = values(&clip.context.world_from_camera.get(0).unwrap().get(0).unwrap().get(1).unwrap());
+    let want = [0.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    for (a, b) in pose.iter().zip(want) {
+        assert!((a - b).abs() < 1e-6, "{pose:?}");
+    }
+    assert_eq!(values(&clip.context.time_sec)[9..], [1.5, 1.5, 1.5]);
+
+    // Surface points of the first front picture, seen again by the front camera at the next timestep.
+    let (h, w) = (options.height, options.width);
+    let picture = |x: &Tensor, t: usize| values(&x.get(0).unwrap().get(t).unwrap().get(1).unwrap());
+    let k = picture(&clip.context.intrinsics, 0);
+    let m = picture(&clip.context.world_from_camera, 1);
+    let truth = &clip.context_truth;
+    let (depth, next) = (picture(&truth.depth, 0), picture(&truth.depth, 1));
+    let (moving, flow) = (picture(&truth.moving, 0), picture(&truth.flow, 0));
+    let (mut same, mut seen) = (0, 0);
+    for i in 0..h * w {
+        if depth[i] == 0.0 {
+            assert_eq!(picture(&truth.sky, 0)[i], 1.0);
+            continue;
+        }
+        if moving[i] == 1.0 {
+            assert!(Vec3::from_slice(&flow[3 * i..]).length() > 0.0);
+            continue;
+        }
+        assert_eq!(flow[3 * i..3 * i + 3], [0.0; 3]);
+        let (u, v) = ((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+        let (x, y) = ((u - k[2]) / k[0] * depth[i], (v - k[5]) / k[4] * depth[i]);
+        // Anchor axes at the first front camera: forward, left, up.
+        let d = Vec3::new(depth[i], -x, -y) - Vec3::new(m[3], m[7], m[11]);
+        let column = |c: usize| Vec3::new(m[c], m[4 + c], m[8 + c]);
+        let p = Vec3::new(column(0).dot(d), column(1).dot(d), column(2).dot(d));
+        let (u, v) = (k[0] * p.x / p.z + k[2], k[4] * p.y / p.z + k[5]);
+        if p.z > 0.5 && u >= 0.0 && v >= 0.0 && (u as usize) < w && (v as usize) < h {
+            seen += 1;
+            same += usize::from((next[v as usize * w + u as usize] - p.z).abs() < SAME_SURFACE * p.z);
+        }
+    }
+    assert!(seen > 200 && same * 10 > seen * 8, "{same} of {seen} points are where they were");
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_batches() {
+    let config = Arc::new(ModelConfig::preset("tiny").unwrap());
+    let options = DataOptions { seed: 9, batch: 2, clips: small(), one_camera_batches: 1 };
+    let run = |threads: usize, first: u64| {
+        let mut loader = Loader::new(options.clone(), Arc::clone(&config), first, threads);
+        (0..3).map(|_| loader.next_batch().unwrap()).collect::<Vec<_>>()
+    };
+    let (one, two, later) = (run(1, 0), run(2, 0), run(2, 1));
+    assert_eq!(one[0].context.image.dims(), [2, 4, 1, 3, 16, 24]);
+    assert_eq!(one[1].context.image.dims(), [2, 4, 3, 3, 16, 24]);
+    for (a, b) in one.iter().zip(&two).chain(one[1..].iter().zip(&later)) {
+        assert_eq!(values(&a.context.image), values(&b.context.image));
+        assert_eq!(values(&a.target.as_ref().unwrap().1.depth), values(&b.target.as_ref().unwrap().1.depth));
+        assert_eq!(values(&a.sky.directions), values(&b.sky.directions));
+    }
+    assert_ne!(values(&one[1].context.image), values(&one[2].context.image));
+}

@@ -1,0 +1,282 @@
+//! Training clips from procedural drives: pictures, poses and ground truth in the window's anchor frame.
+
+use candle_core::{Device, Tensor};
+use glam::{Affine3A, DAffine3, DMat3, DVec3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use storm_render::Intrinsics;
+use storm_render::world::{Drive, DriveOptions, WorldFrame};
+
+use super::error::TrainError;
+use super::truth::{SkySamples, Truth};
+use crate::clip::{ClipBatch, PixelLayout, ViewInput};
+use crate::config::ModelConfig;
+use crate::error::ModelError;
+
+/// Drives that are never trained on: error figures are reported on them.
+pub const HELD_OUT_SEEDS: std::ops::Range<u64> = 10_000..20_000;
+
+/// Frame rate of the moments pictures are taken at, Hz.
+const RATE_HZ: f64 = 10.0;
+
+/// What clips look like.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ClipOptions {
+    /// Cameras, 1-6.
+    pub cameras: usize,
+    /// Picture width, pixels.
+    pub width: usize,
+    /// Picture height, pixels.
+    pub height: usize,
+    /// Context timesteps.
+    pub timesteps: usize,
+    /// Between context timesteps, seconds.
+    pub stride_sec: f64,
+    /// Target times are drawn from this long after the first timestep, seconds; also the network's timespan.
+    pub span_sec: f64,
+    /// Target times; 0 makes context pictures only.
+    pub targets: usize,
+    /// Length of the drive a clip is cut from, seconds.
+    pub drive_sec: f64,
+    /// Least and most traffic (1 is the usual).
+    pub traffic: [f64; 2],
+}
+
+impl Default for ClipOptions {
+    fn default() -> Self {
+        Self {
+            cameras: 3,
+            width: 96,
+            height: 64,
+            timesteps: 4,
+            stride_sec: 0.5,
+            span_sec: 2.0,
+            targets: 4,
+            drive_sec: 12.0,
+            traffic: [0.75, 2.5],
+        }
+    }
+}
+
+impl ClipOptions {
+    /// Camera the anchor sits at: the front one of the drive's rig.
+    pub fn reference(&self) -> usize {
+        usize::from(self.cameras >= 3)
+    }
+
+    fn check(&self) -> Result<(), TrainError> {
+        let rule = |ok: bool, name, value: f64, allowed| {
+            if ok { Ok(()) } else { Err(TrainError::Option { name, value: value.to_string(), allowed }) }
+        };
+        rule(self.stride_sec > 0.0, "stride_sec", self.stride_sec, "more than 0")?;
+        rule(self.span_sec > 0.0, "span_sec", self.span_sec, "more than 0")?;
+        rule((1..=10).contains(&self.timesteps), "timesteps", self.timesteps as f64, "1 to 10")?;
+        rule(self.targets <= 10, "targets", self.targets as f64, "0 to 10")?;
+        let needed = self.length_sec();
+        rule(self.drive_sec >= needed, "drive_sec", self.drive_sec, "at least the clip's length")?;
+        let [low, high] = self.traffic;
+        rule(low >= 0.0 && high >= low, "traffic", low, "a range from 0 to 3")
+    }
+
+    fn length_sec(&self) -> f64 {
+        self.span_sec.max(self.stride_sec * (self.timesteps.max(1) - 1) as f64)
+    }
+}
+
+/// One clip (or a batch of them) with everything the losses need.
+#[derive(Debug, Clone)]
+pub struct TrainClip {
+    /// What the network sees.
+    pub context: ClipBatch,
+    /// What is true in it.
+    pub context_truth: Truth,
+    /// Directions into the context's skies and their colours.
+    pub sky: SkySamples,
+    /// Pictures at the target times, and what is true in them.
+    pub target: Option<(ClipBatch, Truth)>,
+}
+
+/// Which drive, when in it, and how much traffic: everything random about a clip.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ClipPlan {
+    /// Seed of the drive.
+    pub drive_seed: u64,
+    /// The clip's first moment in the drive, seconds.
+    pub start_sec: f64,
+    /// Target times, seconds since `start_sec`, ascending.
+    pub target_sec: Vec<f64>,
+    /// Density of traffic.
+    pub traffic: f64,
+}
+
+impl ClipPlan {
+    /// Sample `index` of the training data of `seed`; never a held-out drive.
+    pub fn training(seed: u64, index: u64, options: &ClipOptions) -> Self {
+        // Seeds of neighbouring samples must not be neighbours: multiply by an odd constant (golden ratio, Weyl's sequence).
+        let mut rng = ChaCha8Rng::seed_from_u64(seed ^ (index + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        let drive_seed = rng.random_range(HELD_OUT_SEEDS.end..u64::MAX);
+        let [low, high] = options.traffic;
+        let traffic = low + (high - low) * rng.random::<f64>();
+        Self::draw(drive_seed, traffic, &mut rng, options)
+    }
+
+    /// A clip of a given drive, for validation: usual traffic, moments drawn from the drive's seed.
+    pub fn of_drive(drive_seed: u64, options: &ClipOptions) -> Self {
+        Self::draw(drive_seed, 1.0, &mut ChaCha8Rng::seed_from_u64(drive_seed), options)
+    }
+
+    fn draw(drive_seed: u64, traffic: f64, rng: &mut ChaCha8Rng, options: &ClipOptions) -> Self {
+        let room = (options.drive_sec - options.length_sec()).max(0.0);
+        let start_sec = room * rng.random::<f64>();
+        let frames = (options.span_sec * RATE_HZ).floor().max(1.0) as u64;
+        let mut target_sec: Vec<f64> =
+            (0..options.targets).map(|_| rng.random_range(0..frames) as f64 / RATE_HZ).collect();
+        target_sec.sort_by(f64::total_cmp);
+        Self { drive_seed, start_sec, target_sec, traffic }
+    }
+
+    /// Drives it. `config` says what the network's depth measures and where its rays pass.
+    pub fn make(&self, options: &ClipOptions, config: &ModelConfig) -> Result<TrainClip, TrainError> {
+        options.check()?;
+        let drive = Drive::new(&DriveOptions {
+            seed: self.drive_seed,
+            seconds: options.drive_sec,
+            cameras: options.cameras,
+            width: options.width,
+            height: options.height,
+            rate_hz: RATE_HZ,
+            traffic: self.traffic,
+            ..DriveOptions::default()
+        })?;
+        let anchor_from_map =
+            inverse(&(map_from_camera(&drive, options.reference(), self.start_sec) * camera_from_flu()));
+        let context_sec: Vec<f64> = (0..options.timesteps).map(|k| k as f64 * options.stride_sec).collect();
+        let shots = |times: &[f64]| self.shots(&drive, times, &anchor_from_map);
+        let context = shots(&context_sec);
+        let target = if self.target_sec.is_empty() { None } else { Some(shots(&self.target_sec)) };
+        let batch = |shots: &[Vec<Shot>]| -> Result<(ClipBatch, Truth), TrainError> {
+            let clip = Shot::clip(shots, options.span_sec)?;
+            Ok((clip, Truth::of(shots, &anchor_from_map.matrix3, config)?))
+        };
+        let (clip, context_truth) = batch(&context)?;
+        Ok(TrainClip {
+            context: clip,
+            context_truth,
+            sky: SkySamples::of(&context, config)?,
+            target: target.as_deref().map(batch).transpose()?,
+        })
+    }
+
+    fn shots(&self, drive: &Drive, times: &[f64], anchor_from_map: &DAffine3) -> Vec<Vec<Shot>> {
+        let shot = |camera: usize, time_sec: f64| {
+            let at = self.start_sec + time_sec;
+            let pose = *anchor_from_map * map_from_camera(drive, camera, at);
+            Shot {
+                frame: drive.render(camera, at),
+                intrinsics: drive.cameras()[camera].intrinsics,
+                anchor_from_camera: affine32(&pose),
+                time_sec: time_sec as f32,
+            }
+        };
+        times.iter().map(|&t| (0..drive.cameras().len()).map(|c| shot(c, t)).collect()).collect()
+    }
+}
+
+/// One picture of a drive and where it was taken in the anchor frame.
+pub(super) struct Shot {
+    pub frame: WorldFrame,
+    pub intrinsics: Intrinsics,
+    pub anchor_from_camera: Affine3A,
+    pub time_sec: f32,
+}
+
+impl Shot {
+    /// Colours in the network range.
+    pub fn colors(&self) -> Vec<f32> {
+        self.frame.rgb.iter().map(|&x| f32::from(x) / 127.5 - 1.0).collect()
+    }
+
+    fn clip(shots: &[Vec<Self>], timespan_sec: f64) -> Result<ClipBatch, ModelError> {
+        let pictures: Vec<Vec<Vec<f32>>> = shots.iter().map(|row| row.iter().map(Self::colors).collect()).collect();
+        let views: Vec<Vec<ViewInput<'_>>> = shots
+            .iter()
+            .zip(&pictures)
+            .map(|(row, pictures)| {
+                row.iter()
+                    .zip(pictures)
+                    .map(|(shot, rgb)| ViewInput {
+                        rgb,
+                        intrinsics: shot.intrinsics,
+                        world_from_camera: shot.anchor_from_camera,
+                        time_sec: shot.time_sec,
+                    })
+                    .collect()
+            })
+            .collect();
+        ClipBatch::from_views(&views, PixelLayout::Hwc, timespan_sec, &Device::Cpu)
+    }
+}
+
+impl TrainClip {
+    /// Several clips of the same sizes as one batch.
+    pub fn stack(clips: &[Self]) -> Result<Self, TrainError> {
+        let all = |pick: fn(&Self) -> ClipBatch| ClipBatch::stack(&clips.iter().map(pick).collect::<Vec<_>>());
+        let targets: Vec<&(ClipBatch, Truth)> = clips.iter().filter_map(|c| c.target.as_ref()).collect();
+        let target = if targets.is_empty() {
+            None
+        } else {
+            let batch = ClipBatch::stack(&targets.iter().map(|t| t.0.clone()).collect::<Vec<_>>())?;
+            Some((batch, Truth::stack(targets.iter().map(|t| &t.1))?))
+        };
+        Ok(Self {
+            context: all(|c| c.context.clone())?,
+            context_truth: Truth::stack(clips.iter().map(|c| &c.context_truth))?,
+            sky: SkySamples::stack(clips.iter().map(|c| &c.sky))?,
+            target,
+        })
+    }
+
+    /// The same on another device.
+    pub fn to_device(&self, device: &Device) -> Result<Self, TrainError> {
+        Ok(Self {
+            context: clip_to(&self.context, device)?,
+            context_truth: self.context_truth.to_device(device)?,
+            sky: self.sky.to_device(device)?,
+            target: match &self.target {
+                Some((clip, truth)) => Some((clip_to(clip, device)?, truth.to_device(device)?)),
+                None => None,
+            },
+        })
+    }
+}
+
+fn clip_to(clip: &ClipBatch, device: &Device) -> candle_core::Result<ClipBatch> {
+    let to = |x: &Tensor| x.to_device(device);
+    Ok(ClipBatch {
+        image: to(&clip.image)?,
+        intrinsics: to(&clip.intrinsics)?,
+        world_from_camera: to(&clip.world_from_camera)?,
+        time_sec: to(&clip.time_sec)?,
+        timespan_sec: clip.timespan_sec,
+    })
+}
+
+fn map_from_camera(drive: &Drive, camera: usize, time_sec: f64) -> DAffine3 {
+    drive.map_from_base(time_sec) * drive.cameras()[camera].base_from_camera
+}
+
+/// From x forward, y left, z up to the optical axes x right, y down, z forward.
+fn camera_from_flu() -> DAffine3 {
+    DAffine3::from_mat3(DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y))
+}
+
+fn inverse(t: &DAffine3) -> DAffine3 {
+    let r = t.matrix3.transpose();
+    DAffine3 { matrix3: r, translation: -(r * t.translation) }
+}
+
+fn affine32(t: &DAffine3) -> Affine3A {
+    Affine3A::from_mat3_translation(t.matrix3.as_mat3(), t.translation.as_vec3())
+}

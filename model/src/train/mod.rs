@@ -1,0 +1,30 @@
+//! Training: data from procedural drives, losses, optimiser, checkpoints, validation.
+
+mod adamw;
+mod checkpoint;
+#[cfg(test)]
+mod clip_tests;
+mod clips;
+mod error;
+mod loader;
+pub mod losses;
+mod options;
+mod perceptual;
+mod pixel;
+mod schedule;
+mod trainer;
+mod truth;
+mod validate;
+
+pub use adamw::AdamOptions;
+pub use checkpoint::provenance;
+pub use clips::{ClipOptions, ClipPlan, HELD_OUT_SEEDS, TrainClip};
+pub use error::TrainError;
+pub use loader::{DataOptions, Loader};
+pub use options::{Stage, TrainOptions};
+pub use perceptual::structure_loss;
+pub use pixel::{PixelLossOptions, pixel_losses};
+pub use schedule::Schedule;
+pub use trainer::{StepReport, Trainer};
+pub use truth::{SkySamples, Truth};
+pub use validate::{VALIDATION_SEEDS, Validation, validate};

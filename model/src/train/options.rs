@@ -1,0 +1,123 @@
+//! Everything that decides what a training run computes. Stored in checkpoints.
+
+use serde::{Deserialize, Serialize};
+
+use super::adamw::AdamOptions;
+use super::clips::ClipOptions;
+use super::error::TrainError;
+use super::losses::RenderLossOptions;
+use super::pixel::PixelLossOptions;
+use super::schedule::Schedule;
+
+/// What the network is taught by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stage {
+    /// Every Gaussian against the truth of its own pixel; draws nothing.
+    Pixel,
+}
+
+/// A training run. With the same options, configuration and first weights, two runs give the same bytes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainOptions {
+    /// Where the first weights came from, for the metadata of the ones made.
+    pub history: String,
+    /// Chooses all samples.
+    pub seed: u64,
+    /// Samples per step.
+    pub batch: usize,
+    /// What is taught.
+    pub stage: Stage,
+    /// Learning rate.
+    pub schedule: Schedule,
+    /// AdamW and clipping.
+    pub adam: AdamOptions,
+    /// Moving average of the weights: how much of it stays per step.
+    pub average_decay: f64,
+    /// Losses of [`Stage::Pixel`].
+    pub pixel: PixelLossOptions,
+    /// Losses on rendered target views.
+    pub render: RenderLossOptions,
+    /// Clips.
+    pub clips: ClipOptions,
+    /// Steps with one camera before all cameras are used.
+    pub one_camera_steps: u64,
+}
+
+impl TrainOptions {
+    /// Options for `steps` steps of `batch` samples with everything else usual.
+    pub fn new(seed: u64, steps: u64, batch: usize, peak: f64) -> Self {
+        let warmup_steps = (steps / 20).min(5000);
+        Self {
+            history: "unknown weights".into(),
+            seed,
+            batch,
+            stage: Stage::Pixel,
+            schedule: Schedule { peak, warmup_steps, steps, end_share: 0.01 },
+            adam: AdamOptions::default(),
+            average_decay: 0.999,
+            pixel: PixelLossOptions::default(),
+            render: RenderLossOptions::default(),
+            clips: ClipOptions::default(),
+            one_camera_steps: 0,
+        }
+    }
+
+    /// Refuses what cannot be trained with.
+    pub fn check(&self) -> Result<(), TrainError> {
+        let rule = |ok: bool, name, value: f64, allowed| {
+            if ok { Ok(()) } else { Err(TrainError::Option { name, value: value.to_string(), allowed }) }
+        };
+        let unit = 0.0..1.0;
+        rule((1..=4096).contains(&self.batch), "batch", self.batch as f64, "1 to 4096")?;
+        let peak = self.schedule.peak;
+        rule(peak > 0.0 && peak <= 1.0, "lr", peak, "more than 0, at most 1")?;
+        rule(self.schedule.steps > 0, "steps", 0.0, "at least 1")?;
+        rule(unit.contains(&self.average_decay), "average_decay", self.average_decay, "0 to below 1")?;
+        let a = &self.adam;
+        rule(unit.contains(&a.beta1), "beta1", a.beta1, "0 to below 1")?;
+        rule(unit.contains(&a.beta2), "beta2", a.beta2, "0 to below 1")?;
+        rule(a.eps > 0.0, "eps", a.eps, "more than 0")?;
+        let p = &self.pixel;
+        let weights = [
+            ("log_depth", p.log_depth),
+            ("depth", p.depth),
+            ("color", p.color),
+            ("opacity", p.opacity),
+            ("scale", p.scale),
+            ("sky_color", p.sky_color),
+            ("velocity", p.velocity),
+            ("flow", p.flow),
+            ("weight_decay", a.weight_decay),
+            ("clip_norm", a.clip_norm),
+        ];
+        for (name, x) in weights {
+            rule(x >= 0.0 && x.is_finite(), name, x, "0 or a positive number")?;
+        }
+        rule(p.moving_weight >= 1.0, "moving_weight", p.moving_weight, "at least 1")?;
+        rule(p.footprint_px > 0.0, "footprint_px", p.footprint_px, "more than 0")
+    }
+
+    /// One line on what weights trained so have seen, for their metadata.
+    pub fn describe(&self) -> String {
+        let labels = match self.stage {
+            Stage::Pixel if self.pixel.flow > 0.0 => "pixel stage: depth, sky, colour and ground-truth flow labels",
+            Stage::Pixel => "pixel stage: depth, sky and colour labels, no flow labels",
+        };
+        let c = &self.clips;
+        format!(
+            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera); batch {}, peak rate {:e}, schedule of {} steps",
+            self.history,
+            self.seed,
+            c.cameras,
+            c.timesteps,
+            c.width,
+            c.height,
+            self.one_camera_steps,
+            self.batch,
+            self.schedule.peak,
+            self.schedule.steps,
+        )
+    }
+}

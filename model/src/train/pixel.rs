@@ -1,0 +1,152 @@
+//! The cheap first stage: every Gaussian against the truth of the pixel it came from, nothing drawn.
+
+use candle_core::{D, Tensor};
+use serde::{Deserialize, Serialize};
+
+use super::clips::TrainClip;
+use super::losses::{Terms, channel_last, color_loss, depth_loss, masked_mean, velocity_loss};
+use crate::config::VelocityKind;
+use crate::error::ModelError;
+use crate::network::ClipOutput;
+
+/// Keeps logarithms and roots of opacities and errors finite.
+const EPS: f64 = 1e-4;
+
+/// Weights of the terms; a term of weight 0 is left out.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PixelLossOptions {
+    /// Mean absolute error of the logarithm of depth.
+    pub log_depth: f64,
+    /// The paper's depth term.
+    pub depth: f64,
+    /// Mean squared colour error after the exposure.
+    pub color: f64,
+    /// Cross-entropy of opacity: 1 on surfaces, 0 in the sky.
+    pub opacity: f64,
+    /// Mean absolute error of the logarithm of the scales to the pixel's footprint.
+    pub scale: f64,
+    /// Standard deviation a Gaussian should have, pixels of its picture: neighbours then overlap without gaps or blur.
+    pub footprint_px: f64,
+    /// Mean squared sky colour error on sky pixels.
+    pub sky_color: f64,
+    /// Mean squared velocity component (paper: 0.005).
+    pub velocity: f64,
+    /// Mean velocity error against ground-truth flow; 0 trains without flow labels.
+    pub flow: f64,
+    /// How much more a moving pixel weighs than a standing one in the flow term.
+    pub moving_weight: f64,
+}
+
+impl Default for PixelLossOptions {
+    fn default() -> Self {
+        Self {
+            log_depth: 1.0,
+            depth: 1.0,
+            color: 1.0,
+            opacity: 0.1,
+            scale: 0.1,
+            footprint_px: 0.6,
+            sky_color: 1.0,
+            velocity: 0.005,
+            flow: 0.1,
+            moving_weight: 10.0,
+        }
+    }
+}
+
+/// All terms of a batch. Only the clip's context is used.
+pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOptions) -> Result<Terms, ModelError> {
+    let truth = &clip.context_truth;
+    let surface = truth.sky.affine(-1.0, 1.0)?;
+    let mut terms = Terms::default();
+    let mut add = |name: &'static str, weight: f64, value: Option<Tensor>| -> Result<(), ModelError> {
+        if let Some(value) = value {
+            terms.push(name, (value * weight)?);
+        }
+        Ok(())
+    };
+    if options.log_depth > 0.0 {
+        // Sky pixels have no depth; the one put there only keeps the logarithm finite.
+        let known = (&truth.distance + &truth.sky)?;
+        let error = (output.depths.log()? - known.log()?)?.abs()?;
+        add("log_depth", options.log_depth, masked_mean(&error, &surface)?)?;
+    }
+    if options.depth > 0.0 {
+        add("depth", options.depth, depth_loss(&output.depths, &truth.distance)?)?;
+    }
+    if options.color > 0.0 {
+        let exposed = exposed(output, &output.colors)?;
+        add("color", options.color, Some(color_loss(&exposed, &channel_last(&clip.context.image)?)?))?;
+    }
+    if options.opacity > 0.0 {
+        // The probability given to what is there.
+        let right = ((&output.opacities * surface.affine(2.0, -1.0)?)? + &truth.sky)?;
+        add("opacity", options.opacity, Some(right.affine(1.0 - EPS, EPS)?.log()?.neg()?.mean_all()?))?;
+    }
+    if options.scale > 0.0 {
+        let wanted = footprint(clip, options.footprint_px, output.config.max_scale)?.log()?.unsqueeze(D::Minus1)?;
+        let error = output.scales.log()?.broadcast_sub(&wanted)?.abs()?.mean(D::Minus1)?;
+        add("scale", options.scale, masked_mean(&error, &surface)?)?;
+    }
+    if options.sky_color > 0.0 {
+        add("sky_color", options.sky_color, sky_color_loss(output, clip)?)?;
+    }
+    let velocities = velocities(output);
+    if options.velocity > 0.0 {
+        add("velocity", 1.0, Some(velocity_loss(&velocities, options.velocity)?))?;
+    }
+    if options.flow > 0.0 {
+        let weights = (&surface * truth.moving.affine(options.moving_weight - 1.0, 1.0)?)?;
+        let share = options.flow / velocities.len() as f64;
+        let mut sum: Option<Tensor> = None;
+        for v in velocities {
+            let error = ((v - &truth.flow)?.sqr()?.sum(D::Minus1)? + EPS * EPS)?.sqrt()?;
+            sum = match (sum, masked_mean(&error, &weights)?) {
+                (Some(a), Some(b)) => Some((a + b)?),
+                (a, b) => a.or(b),
+            };
+        }
+        add("flow", share, sum)?;
+    }
+    Ok(terms)
+}
+
+/// The velocities of a network, each once.
+pub(super) fn velocities(output: &ClipOutput) -> Vec<&Tensor> {
+    match output.config.velocity {
+        VelocityKind::One => vec![&output.velocity_forward],
+        VelocityKind::ForwardBackward => vec![&output.velocity_backward, &output.velocity_forward],
+    }
+}
+
+/// Colours `(b, t, v, h, w, 3)` after their camera's exposure.
+fn exposed(output: &ClipOutput, colors: &Tensor) -> Result<Tensor, ModelError> {
+    let &[b, t, v, h, w, _] = colors.dims() else {
+        return Err(ModelError::Input(format!("colours have shape {:?}", colors.dims())));
+    };
+    if output.affine.is_none() {
+        return Ok(colors.clone());
+    }
+    let by_camera = colors.transpose(1, 2)?.contiguous()?.reshape((b, v, t * h * w, 3))?;
+    let exposed = output.apply_affine(&by_camera)?.reshape((b, v, t, h, w, 3))?;
+    Ok(exposed.transpose(1, 2)?.contiguous()?)
+}
+
+/// `(b, t, v, h, w)`: `footprint_px` pixels at the true z-depth, metres, at most `max_scale`; 1 in the sky.
+fn footprint(clip: &TrainClip, footprint_px: f64, max_scale: f64) -> Result<Tensor, ModelError> {
+    let truth = &clip.context_truth;
+    let focal = |i: usize| clip.context.intrinsics.narrow(3, i, 1)?.narrow(4, i, 1);
+    let focal = ((focal(0)? + focal(1)?)? * 0.5)?;
+    let metres = (truth.depth.broadcast_div(&focal)? * footprint_px)?.minimum(max_scale)?;
+    Ok((metres + &truth.sky)?)
+}
+
+fn sky_color_loss(output: &ClipOutput, clip: &TrainClip) -> Result<Option<Tensor>, ModelError> {
+    let sky = &clip.sky;
+    let (b, v, n, _) = sky.directions.dims4()?;
+    let Some(colors) = output.sky_color(&sky.directions.reshape((b, v * n, 3))?)? else { return Ok(None) };
+    let colors = output.apply_affine(&colors.reshape((b, v, n, 3))?)?;
+    let error = ((colors - &sky.colors)? * 0.5)?.sqr()?.mean_keepdim(D::Minus1)?;
+    Ok(masked_mean(&error, &sky.weights)?)
+}

@@ -1,0 +1,205 @@
+//! One training step after another: forward, losses, backward, AdamW, with nothing non-finite let through.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use candle_core::{Device, Tensor, Var};
+
+use super::adamw::{self, Slot};
+use super::clips::TrainClip;
+use super::error::TrainError;
+use super::loader::DataOptions;
+use super::losses::Terms;
+use super::options::{Stage, TrainOptions};
+use super::pixel::pixel_losses;
+use crate::config::ModelConfig;
+use crate::error::ModelError;
+use crate::network::Storm;
+use crate::weights::Tensors;
+
+/// The one tensor that is never trained.
+const FROZEN: &str = "max_scale";
+
+/// What a step did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepReport {
+    /// The step, counted from 0.
+    pub step: u64,
+    /// Sum of the terms.
+    pub total: f64,
+    /// Every term, weight applied.
+    pub terms: Vec<(&'static str, f64)>,
+    /// Learning rate used.
+    pub learning_rate: f64,
+    /// Length of the gradient before clipping.
+    pub gradient_norm: f64,
+    /// Seconds of the forward pass and losses, of the backward pass, and of the update.
+    pub seconds: [f64; 3],
+}
+
+/// A network being trained.
+pub struct Trainer {
+    config: Arc<ModelConfig>,
+    options: TrainOptions,
+    device: Device,
+    slots: Vec<Slot>,
+    vars: Vec<Var>,
+    frozen: Tensors,
+    model: Storm,
+    step: u64,
+}
+
+impl Trainer {
+    /// Starts from given weights.
+    pub fn new(
+        config: &ModelConfig,
+        weights: &Tensors,
+        options: TrainOptions,
+        device: &Device,
+    ) -> Result<Self, TrainError> {
+        let slots = weights
+            .iter()
+            .filter(|(name, _)| name.as_str() != FROZEN)
+            .map(|(name, x)| Ok(Slot::new(name, x.dims(), x.flatten_all()?.to_vec1()?)))
+            .collect::<Result<_, TrainError>>()?;
+        let frozen = weights.iter().filter(|(name, _)| name.as_str() == FROZEN);
+        let frozen =
+            frozen.map(|(name, x)| Ok((name.clone(), x.to_device(device)?))).collect::<Result<_, TrainError>>()?;
+        Self::assemble(config, slots, frozen, options, 0, device)
+    }
+
+    pub(super) fn assemble(
+        config: &ModelConfig,
+        slots: Vec<Slot>,
+        frozen: Tensors,
+        options: TrainOptions,
+        step: u64,
+        device: &Device,
+    ) -> Result<Self, TrainError> {
+        options.check()?;
+        let var = |s: &Slot| Var::from_vec(s.weight.clone(), &s.shape[..], device);
+        let vars = slots.iter().map(var).collect::<candle_core::Result<Vec<_>>>()?;
+        let mut tensors: BTreeMap<String, Tensor> = frozen.clone();
+        tensors.extend(slots.iter().zip(&vars).map(|(s, v)| (s.name.clone(), v.as_tensor().clone())));
+        let model = Storm::new(config, &tensors)?;
+        let config = Arc::new(model.config().clone());
+        Ok(Self { config, options, device: device.clone(), slots, vars, frozen, model, step })
+    }
+
+    /// The network's configuration.
+    pub fn config(&self) -> &Arc<ModelConfig> {
+        &self.config
+    }
+
+    /// The run's options.
+    pub fn options(&self) -> &TrainOptions {
+        &self.options
+    }
+
+    /// Steps taken so far.
+    pub fn steps_done(&self) -> u64 {
+        self.step
+    }
+
+    /// The samples of this run, batch `n` belonging to step `n`.
+    pub fn data(&self) -> DataOptions {
+        let o = &self.options;
+        let mut clips = o.clips;
+        if o.stage == Stage::Pixel {
+            // Nothing is drawn, so target pictures would be made for nothing.
+            clips.targets = 0;
+        }
+        DataOptions { seed: o.seed, batch: o.batch, clips, one_camera_batches: o.one_camera_steps }
+    }
+
+    pub(super) fn parts(&self) -> (&[Slot], &Tensors) {
+        (&self.slots, &self.frozen)
+    }
+
+    /// Number of trained weights.
+    pub fn weight_count(&self) -> usize {
+        self.slots.iter().map(|s| s.weight.len()).sum()
+    }
+
+    /// Copies of the weights, by name: their moving average, or as they are.
+    pub fn weights(&self, average: bool) -> Result<Tensors, TrainError> {
+        let mut out = self.frozen.clone();
+        for s in &self.slots {
+            let values = if average { &s.average } else { &s.weight };
+            out.insert(s.name.clone(), Tensor::from_slice(values, &s.shape[..], &self.device)?);
+        }
+        Ok(out)
+    }
+
+    /// Trains on one batch.
+    ///
+    /// # Errors
+    /// [`TrainError::NonFinite`] names the step and the tensor; the weights are then still those before the step (except
+    /// where it is a weight).
+    pub fn step(&mut self, clip: &TrainClip) -> Result<StepReport, TrainError> {
+        let start = Instant::now();
+        let moved;
+        let clip = if self.device.is_cpu() {
+            clip
+        } else {
+            moved = clip.to_device(&self.device)?;
+            &moved
+        };
+        let output = self.model.forward(&clip.context)?;
+        let terms = self.losses(&output, clip)?;
+        let values = terms.values()?;
+        if let Some((name, _)) = values.iter().find(|(_, x)| !x.is_finite()) {
+            return Err(self.non_finite(format!("loss {name}"), 1));
+        }
+        let total = terms.total()?;
+        let forward_sec = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let grads = total.backward()?;
+        let mut gradients = Vec::with_capacity(self.vars.len());
+        for (var, slot) in self.vars.iter().zip(&self.slots) {
+            let gradient = match grads.get(var) {
+                Some(g) => Some(g.flatten_all()?.to_vec1::<f32>()?),
+                None => None,
+            };
+            let bad = gradient.iter().flatten().filter(|x| !x.is_finite()).count();
+            if bad > 0 {
+                return Err(self.non_finite(format!("gradient of {}", slot.name), bad));
+            }
+            gradients.push(gradient);
+        }
+        drop((grads, output, terms));
+        let backward_sec = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let learning_rate = self.options.schedule.at(self.step);
+        let (decay, adam) = (self.options.average_decay, self.options.adam);
+        let gradient_norm = adamw::step(&mut self.slots, &gradients, self.step, learning_rate, decay, &adam);
+        for (var, slot) in self.vars.iter().zip(&self.slots) {
+            let bad = slot.weight.iter().filter(|x| !x.is_finite()).count();
+            if bad > 0 {
+                return Err(self.non_finite(format!("weight {}", slot.name), bad));
+            }
+            var.set(&Tensor::from_slice(&slot.weight, &slot.shape[..], &self.device)?)?;
+        }
+        let step = self.step;
+        self.step += 1;
+        Ok(StepReport {
+            step,
+            total: values.iter().map(|(_, x)| x).sum(),
+            terms: values,
+            learning_rate,
+            gradient_norm,
+            seconds: [forward_sec, backward_sec, start.elapsed().as_secs_f64()],
+        })
+    }
+
+    fn losses(&self, output: &crate::ClipOutput, clip: &TrainClip) -> Result<Terms, ModelError> {
+        match self.options.stage {
+            Stage::Pixel => pixel_losses(output, clip, &self.options.pixel),
+        }
+    }
+
+    fn non_finite(&self, tensor: String, count: usize) -> TrainError {
+        TrainError::NonFinite { step: self.step, tensor, batch_seed: self.options.seed, count }
+    }
+}
