@@ -79,8 +79,10 @@ impl Work {
         self.by_depth.reserve(gpu, n)?;
         let most = most_pairs(gpu);
         gpu.fits("entries of tile lists", pairs, most)?;
-        let wanted = pairs.max(FIRST_CAPACITY.max(CAPACITY_PER_SPLAT * n).min(most));
-        if wanted > u64::from(self.capacity) {
+        let least = pairs.max(FIRST_CAPACITY.max(CAPACITY_PER_SPLAT * n).min(most));
+        if least > u64::from(self.capacity) {
+            // The next view may need a little more than this one.
+            let wanted = (least + least / 4).min(most);
             self.capacity = 0;
             self.by_tile.reserve(gpu, wanted)?;
             self.capacity = wanted as u32;

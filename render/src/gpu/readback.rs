@@ -110,21 +110,8 @@ impl Staging {
         channels: u32,
         timings: &mut GpuTimings,
     ) -> Result<(Vec<Outcome>, u32), GpuError> {
-        let buffer = self.buffer.raw();
-        let (sender, receiver) = mpsc::channel();
-        buffer.map_async(MapMode::Read, .., move |result| {
-            // The receiver is gone only when an error has been reported already.
-            let _ = sender.send(result);
-        });
-        let polled = gpu.device.poll(PollType::wait_indefinitely());
-        gpu.check()?;
-        polled.map_err(|e| gpu.failed(e))?;
-        match receiver.try_recv() {
-            Ok(Ok(())) => {}
-            Ok(Err(e)) => return Err(gpu.failed(e)),
-            Err(_) => return Err(gpu.failed("the results were never mapped")),
-        }
-        let results = buffer.get_mapped_range(..).map_err(|e| gpu.failed(e)).and_then(|bytes| {
+        let results = self.map(gpu).and_then(|()| {
+            let bytes = self.buffer.raw().get_mapped_range(..).map_err(|e| gpu.failed(e))?;
             let mut start = 0;
             let mut outcomes = Vec::with_capacity(views.len());
             for view in views {
@@ -139,8 +126,25 @@ impl Staging {
             }
             Ok((outcomes, invalid.first().copied().unwrap_or(0)))
         });
-        buffer.unmap();
+        // Also after an error: a buffer that is still waiting to be mapped could not be used again.
+        self.buffer.raw().unmap();
         results
+    }
+
+    /// Waits until the host sees the buffer.
+    fn map(&self, gpu: &Gpu) -> Result<(), GpuError> {
+        let (sender, receiver) = mpsc::channel();
+        self.buffer.raw().map_async(MapMode::Read, .., move |result| {
+            // The receiver is gone only when an error has been reported already.
+            let _ = sender.send(result);
+        });
+        let polled = gpu.device.poll(PollType::wait_indefinitely());
+        gpu.check()?;
+        polled.map_err(|e| gpu.failed(e))?;
+        match receiver.try_recv() {
+            Ok(mapped) => mapped.map_err(|e| gpu.failed(e)),
+            Err(_) => Err(gpu.failed("the results were never mapped")),
+        }
     }
 }
 

@@ -28,26 +28,25 @@ pub fn each(settings: RasterSettings, mut check: impl FnMut(&mut Backend)) {
 pub fn with_device(settings: RasterSettings, check: impl FnOnce(&mut storm_render::gpu::GpuRasterizer)) {
     use std::sync::{Mutex, OnceLock, PoisonError};
     use storm_render::gpu::{GpuOptions, GpuRasterizer};
-    static SHARED: OnceLock<Option<Mutex<GpuRasterizer>>> = OnceLock::new();
+    static SHARED: OnceLock<Result<Mutex<GpuRasterizer>, String>> = OnceLock::new();
     let shared = SHARED.get_or_init(|| match GpuRasterizer::new(settings, &GpuOptions::default()) {
         Ok(gpu) => {
             println!("device: {}", gpu.describe());
-            Some(Mutex::new(gpu))
+            Ok(Mutex::new(gpu))
         }
         Err(error) => {
             let required = std::env::var("REQUIRE_GPU_ADAPTER").is_ok_and(|value| value == "1");
             assert!(!required, "REQUIRE_GPU_ADAPTER=1, but: {error}");
-            println!("SKIPPED: no wgpu adapter ({error})");
-            None
+            Err(error.to_string())
         }
     });
     match shared {
         // A test that failed leaves nothing half done that the next could see: every render starts anew.
-        Some(gpu) => {
+        Ok(gpu) => {
             let mut gpu = gpu.lock().unwrap_or_else(PoisonError::into_inner);
             gpu.set_settings(settings).unwrap();
             check(&mut gpu);
         }
-        None => println!("SKIPPED: no wgpu adapter"),
+        Err(error) => println!("SKIPPED: no wgpu adapter ({error})"),
     }
 }

@@ -73,11 +73,14 @@ fn tile_lists_grow_when_a_view_needs_more() {
         let mut scene = Scene::copies(3000, 1);
         scene.scales = vec![[1e4; 3]; 3000];
         scene.opacities = vec![0.8; 3000];
+        scene.features = (0..3000).map(|i| if i < 5 { 1.0 } else { 0.0 }).collect();
         let pictures = gpu.render(&scene.splats(), &[front_view(640, 480)]).unwrap();
         assert_eq!(gpu.stats().pairs, 3000 * 40 * 30);
         // 0.2^5 > 1e-4 >= 0.2^6.
         let expected = 1.0 - 0.2f32.powi(5);
         assert!(pictures[0].alpha.iter().all(|&a| (a - expected).abs() < 1e-5), "{}", pictures[0].alpha[0]);
+        // All are equally far, so the first five of the array are what every tile shows: long sorts are stable.
+        assert!(pictures[0].features.iter().zip(&pictures[0].alpha).all(|(c, a)| (c - a).abs() < 1e-6));
     });
 }
 

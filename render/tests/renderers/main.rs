@@ -3,6 +3,8 @@
 //! The device's part runs with `--features wgpu`. Without an adapter it prints `SKIPPED: ...`, or fails where
 //! `REQUIRE_GPU_ADAPTER=1` is set.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
 mod agreement;
 mod backends;
 mod degenerate;
