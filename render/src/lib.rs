@@ -5,7 +5,10 @@
 
 pub mod camera;
 pub mod gaussians;
+#[cfg(feature = "wgpu")]
+pub mod gpu;
 pub mod raster;
+pub mod renderer;
 pub mod world;
 
 pub use camera::{Intrinsics, View};
