@@ -13,3 +13,4 @@ pub mod world;
 
 pub use camera::{Intrinsics, View};
 pub use gaussians::Gaussians;
+pub use renderer::{RenderError, Renderer};

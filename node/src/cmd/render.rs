@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use glam::{DQuat, DVec3, EulerRot, Vec3};
 use storm_render::raster::{CpuRasterizer, Picture as RasterPicture, RasterSettings, Splats};
-use storm_render::{Intrinsics, View};
+use storm_render::{Intrinsics, Renderer, View};
 
 use super::{Outcome, UsageError};
 use crate::engine::select::MOVING_MPS;
@@ -48,6 +48,9 @@ pub struct Args {
     /// What to draw.
     #[arg(long, default_value = "color")]
     what: What,
+    /// What draws: cpu, or wgpu (any GPU; a build with --features wgpu).
+    #[arg(long, default_value = "cpu", value_parser = ["cpu", "wgpu"])]
+    device: String,
     /// Picture width, pixels.
     #[arg(long, default_value_t = 960)]
     width: usize,
@@ -93,11 +96,12 @@ pub fn run(args: &Args) -> Result<Outcome> {
     }
     let saved = load(&args.map, args.step)?;
     let intrinsics = Intrinsics::from_fov(args.fov, args.width, args.height);
-    let mut raster = CpuRasterizer::new(RasterSettings::default())?;
+    let mut raster = renderer(&args.device)?;
+    tracing::info!("drawing on {}", raster.describe());
     let mut one = |pose: &Rigid, out: &Path| -> Result<bool> {
         let local_from_camera = saved.map_from_local.inverse() * *pose * crate::window::camera_from_flu().inverse();
         let view = View::from_pose(local_from_camera.to_f32(), intrinsics);
-        let picture = draw(&mut raster, &saved, &view, args.time)?;
+        let picture = draw(&mut *raster, &saved, &view, args.time)?;
         finish(&picture, args.what)?.write_png(out).with_context(|| format!("cannot write {}", out.display()))?;
         Ok(picture.alpha.iter().any(|&a| a > 0.0))
     };
@@ -122,6 +126,21 @@ pub fn run(args: &Args) -> Result<Outcome> {
     Ok(Outcome::Done)
 }
 
+fn renderer(device: &str) -> Result<Box<dyn Renderer>> {
+    let settings = RasterSettings::default();
+    if device == "cpu" {
+        return Ok(Box::new(CpuRasterizer::new(settings)?));
+    }
+    #[cfg(feature = "wgpu")]
+    {
+        use storm_render::gpu::{GpuOptions, GpuRasterizer};
+        Ok(Box::new(GpuRasterizer::new(settings, &GpuOptions::default())?))
+    }
+    #[cfg(not(feature = "wgpu"))]
+    Err(UsageError("--device wgpu: this program was built without it; cargo build --release --features wgpu".into())
+        .into())
+}
+
 fn load(path: &Path, step: Option<usize>) -> Result<SavedGaussians> {
     let is_ply = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply"));
     match (path.is_dir(), is_ply, step) {
@@ -137,7 +156,7 @@ fn load(path: &Path, step: Option<usize>) -> Result<SavedGaussians> {
 const BASE_CHANNELS: usize = 6;
 
 /// Colour, velocity and one channel per motion group, depth and coverage.
-fn draw(raster: &mut CpuRasterizer, saved: &SavedGaussians, view: &View, time_sec: f32) -> Result<RasterPicture> {
+fn draw(raster: &mut dyn Renderer, saved: &SavedGaussians, view: &View, time_sec: f32) -> Result<RasterPicture> {
     let cloud = &saved.cloud;
     let still = [0.0f32; 3];
     let velocity = |i: usize| saved.velocities.get(i).unwrap_or(&still);
