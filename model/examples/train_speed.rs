@@ -144,6 +144,8 @@ impl Best {
 }
 
 fn main() -> Result<()> {
+    // SAFETY: nothing has started a thread yet.
+    unsafe { ops::set_up_training() };
     let args: Vec<String> = std::env::args().collect();
     let number = |name: &str, default: usize| -> Result<usize> {
         match args.iter().position(|a| a == name) {

@@ -10,6 +10,7 @@
 //! loaded for inference alone.
 
 mod graph;
+mod process;
 mod training;
 
 use std::sync::{Arc, OnceLock};
@@ -20,6 +21,8 @@ use crate::kernels::gemm::{self, Epilogue, PackedWeight};
 use crate::kernels::tensors::{covered, tracked, with_optional, with_values};
 use crate::kernels::{self, Isa};
 use crate::plain;
+
+pub use process::set_up_training;
 
 /// A linear layer: weight `(out, in)` as PyTorch stores it, optional bias `(out)`.
 ///

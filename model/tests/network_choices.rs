@@ -273,7 +273,7 @@ fn gradients_reach_every_trained_tensor_and_weights_are_followed() {
     let storm = Storm::new(&config, &tensors).unwrap();
     let clip = clip(2, 2, 8, 12);
     let output = storm.forward(&clip).unwrap();
-    // Variables take the reference operations, plain tensors the kernels: both give the same numbers.
+    // Variables keep what the backward pass needs, plain tensors do not: both give the same numbers.
     let fast = Storm::new(&config, &plain).unwrap().forward(&clip).unwrap();
     assert!(worst(&values(&output.means), &values(&fast.means)) < 1e-3);
     assert!(worst(&values(&output.velocity_forward), &values(&fast.velocity_forward)) < 1e-4);

@@ -48,8 +48,9 @@ impl Transformer {
         let mut x = tokens;
         for (k, block) in self.blocks.iter().enumerate() {
             x = block.forward(&x, self.heads, &mut |part, tensor| {
-                if stages.wants(&format!("block_{k}.{part}")) {
-                    stages.keep(&format!("block_{k}.{part}"), &tensor?);
+                let name = format!("block_{k}.{part}");
+                if stages.wants(&name) {
+                    stages.keep(&name, &tensor()?);
                 }
                 Ok(())
             })?;
@@ -61,21 +62,22 @@ impl Transformer {
     }
 }
 
-type Probe<'a> = dyn FnMut(&str, candle_core::Result<Tensor>) -> candle_core::Result<()> + 'a;
+/// Takes what is only computed when it is kept.
+type Probe<'a> = dyn FnMut(&str, &dyn Fn() -> candle_core::Result<Tensor>) -> candle_core::Result<()> + 'a;
 
 impl Block {
     fn forward(&self, x: &Tensor, heads: usize, probe: &mut Probe<'_>) -> candle_core::Result<Tensor> {
         let y = self.norm1.forward(x)?;
-        probe("norm1", Ok(y.clone()))?;
+        probe("norm1", &|| Ok(y.clone()))?;
         let qkv = linear(&y, &self.qkv, Activation::None, None)?;
-        probe("attn.qkv", Ok(qkv.clone()))?;
+        probe("attn.qkv", &|| Ok(qkv.clone()))?;
         let attended = linear(&attention(&qkv, heads)?, &self.proj, Activation::None, Some(x))?;
         drop(qkv);
-        probe("attn", &attended - x)?;
+        probe("attn", &|| &attended - x)?;
         let y = self.norm2.forward(&attended)?;
-        probe("norm2", Ok(y.clone()))?;
+        probe("norm2", &|| Ok(y.clone()))?;
         let out = mlp(&y, &self.fc1, Activation::Gelu, &self.fc2, Some(&attended))?;
-        probe("mlp", &out - &attended)?;
+        probe("mlp", &|| &out - &attended)?;
         Ok(out)
     }
 }

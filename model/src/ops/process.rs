@@ -1,0 +1,51 @@
+//! What a process that trains asks of candle's threads and of the C library's allocator.
+
+/// Environment variable with the number of threads of candle's own pool.
+const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
+
+/// Makes this process train faster; results do not change. For programs that train, not for those that only infer.
+///
+/// - candle runs its own element-wise operations on the thread that calls them (unless the user set
+///   `CANDLE_NUM_THREADS`). By default it gives those on more than 65,536 values to a second thread pool beside rayon's,
+///   whose threads spin while they wait. A backward pass has hundreds of them (candle adds each gradient to zeros), and
+///   the spinning takes the cores from the kernels: the `train_network` example needs more than twice the processor time.
+///   Matrix products and the kernels keep all threads.
+/// - With glibc, memory that was freed is kept for the next step instead of being handed back to the system and fetched,
+///   page by page, again: about a tenth of a step. The process stays as large as its largest step.
+///
+/// # Safety
+/// This writes to the environment, which candle reads at its first operation: no other thread may read or write it
+/// meanwhile. Call it first in `main`.
+pub unsafe fn set_up_training() {
+    if std::env::var_os(CANDLE_THREADS).is_none() {
+        // SAFETY: the caller's contract.
+        unsafe { std::env::set_var(CANDLE_THREADS, "1") };
+    }
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    glibc::keep_freed_memory();
+}
+
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+mod glibc {
+    use std::ffi::c_int;
+
+    /// `malloc.h`: free memory at the top of the heap beyond this many bytes goes back to the system.
+    const M_TRIM_THRESHOLD: c_int = -1;
+    /// `malloc.h`: blocks of this many bytes and more are mapped and unmapped one by one.
+    const M_MMAP_THRESHOLD: c_int = -3;
+    /// The largest the library takes on 64-bit machines.
+    const LARGEST_MMAP_THRESHOLD: c_int = 32 << 20;
+
+    unsafe extern "C" {
+        fn mallopt(parameter: c_int, value: c_int) -> c_int;
+    }
+
+    /// A refused value leaves the allocator as it was.
+    pub fn keep_freed_memory() {
+        // SAFETY: `mallopt` takes two numbers and locks the allocator itself.
+        unsafe {
+            mallopt(M_MMAP_THRESHOLD, LARGEST_MMAP_THRESHOLD);
+            mallopt(M_TRIM_THRESHOLD, c_int::MAX);
+        }
+    }
+}
