@@ -160,8 +160,11 @@ fn blend_splat<const FMA: bool>(
         }
         let mut finished = [0u32; WIDTH];
         let rows = transmittance[cut.y0..cut.y1].iter_mut();
-        let sums = sums[cut.y0 * planes..].chunks_exact_mut(planes);
-        for ((y, row), sums) in (cut.y0..cut.y1).zip(rows).zip(sums) {
+        // Not `chunks_exact_mut`: its length is a division, which costs as much as a row.
+        let mut rest = &mut sums[cut.y0 * planes..];
+        for (y, row) in (cut.y0..cut.y1).zip(rows) {
+            let Some((sums, after)) = std::mem::take(&mut rest).split_at_mut_checked(planes) else { break };
+            rest = after;
             let dy = top + y as f32 - record.v;
             let shift = record.slope * dy;
             let along = record.along * dy * dy;
@@ -172,7 +175,7 @@ fn blend_splat<const FMA: bool>(
                 falloff[l] = fma::<FMA>(record.across * across, across, along);
             }
             exp2_neg_lanes::<FMA>(&mut falloff);
-            let step = shade(&falloff, before, record.opacity, input.alpha_cap);
+            let step = shade::<FMA>(&falloff, before, record.opacity, input.alpha_cap);
             *before = step.after;
             for l in 0..WIDTH {
                 finished[l] |= step.finished[l];
@@ -211,9 +214,9 @@ struct Step {
 /// Weights of a splat whose falloff and whose pixels' transmittance are given. One operation per loop, conditions as
 /// bit masks: straight-line code the compiler reliably turns into vectors.
 #[inline(always)]
-fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap: f32) -> Step {
+fn shade<const FMA: bool>(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap: f32) -> Step {
     let (mut alpha, mut hit, mut weight) = ([0.0f32; WIDTH], [0u32; WIDTH], [0.0f32; WIDTH]);
-    let (mut passed, mut after, mut finished) = ([0.0f32; WIDTH], [0.0f32; WIDTH], [0u32; WIDTH]);
+    let (mut after, mut finished) = ([0.0f32; WIDTH], [0u32; WIDTH]);
     for l in 0..WIDTH {
         alpha[l] = opacity * falloff[l];
     }
@@ -224,15 +227,15 @@ fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap:
         hit[l] = mask(alpha[l] >= ALPHA_MIN) & mask(before[l] > 0.0);
     }
     for l in 0..WIDTH {
-        weight[l] = f32::from_bits((alpha[l] * before[l]).to_bits() & hit[l]);
-    }
-    // Not `before - weight`: behind an alpha near 1 little more than its rounding would be left, and the backward pass
-    // divides the same factor out again.
-    for l in 0..WIDTH {
-        passed[l] = 1.0 - f32::from_bits(alpha[l].to_bits() & hit[l]);
+        alpha[l] = f32::from_bits(alpha[l].to_bits() & hit[l]);
     }
     for l in 0..WIDTH {
-        after[l] = before[l] * passed[l];
+        weight[l] = alpha[l] * before[l];
+    }
+    // Not `before - weight`, rounded twice: behind an alpha near 1 little more than the rounding would be left, and the
+    // backward pass divides the same factor out again.
+    for l in 0..WIDTH {
+        after[l] = if FMA { fma::<FMA>(-alpha[l], before[l], before[l]) } else { before[l] * (1.0 - alpha[l]) };
     }
     for l in 0..WIDTH {
         finished[l] = mask(after[l] <= TRANSMITTANCE_STOP) & hit[l];
@@ -252,13 +255,17 @@ fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap:
 #[cold]
 #[inline(never)]
 fn retire(live: &mut [u32; TILE_H], done: &mut Vec<Finished>, transmittance: &[Row; TILE_H], cut: &Cut, strip: usize) {
-    for y in cut.y0..cut.y1 {
-        for (x, &t) in transmittance[y].iter().enumerate().skip(strip).take(WIDTH.min(TILE_W - strip)) {
-            let bit = 1 << x;
-            if t < 0.0 && live[y] & bit != 0 {
-                live[y] &= !bit;
-                done.push(Finished { position: cut.position, x: x as u8, y: y as u8 });
-            }
+    for (y, (bits, row)) in live.iter_mut().zip(transmittance).enumerate().take(cut.y1).skip(cut.y0) {
+        let Some(row) = row[strip..].first_chunk::<WIDTH>() else { continue };
+        let mut negative = [0u32; WIDTH];
+        for l in 0..WIDTH {
+            negative[l] = (row[l].to_bits() >> 31) << l;
+        }
+        let mut left = *bits & (negative.iter().fold(0, |a, b| a | b) << strip);
+        *bits &= !left;
+        while left != 0 {
+            done.push(Finished { position: cut.position, x: left.trailing_zeros() as u8, y: y as u8 });
+            left &= left - 1;
         }
     }
 }

@@ -8,8 +8,7 @@
 use super::settings::ALPHA_MIN;
 use super::simd::{dispatch, exp2_neg_lanes, fma, prefetch};
 use super::tile::{
-    BATCH, Cut, EDGE, LINE_FLOATS, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, locate, low_bits, mask,
-    prefetch_records,
+    BATCH, Cut, EDGE, LINE_FLOATS, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, locate, mask, prefetch_records,
 };
 use super::tiles::{TILE_H, TILE_W};
 use std::sync::atomic::Ordering;
@@ -189,13 +188,12 @@ fn unblend_splat<const FMA: bool>(input: &TileInput, cut: &Cut, scratch: &mut Un
         for l in 0..WIDTH {
             dx[l] = first + l as f32;
         }
-        let columns = low_bits(WIDTH) << strip;
         let rows = scratch.transmittance[cut.y0..cut.y1].iter_mut().zip(&mut scratch.behind[cut.y0..cut.y1]);
-        let upstream = scratch.upstream[cut.y0 * planes..].chunks_exact(planes);
-        for ((y, (transmittance, behind)), upstream) in (cut.y0..cut.y1).zip(rows).zip(upstream) {
-            if scratch.live[y] & columns == 0 {
-                continue;
-            }
+        // Not `chunks_exact`: its length is a division, which costs as much as a row.
+        let mut rest = &scratch.upstream[cut.y0 * planes..];
+        for (y, (transmittance, behind)) in (cut.y0..cut.y1).zip(rows) {
+            let Some((upstream, after)) = rest.split_at_checked(planes) else { break };
+            rest = after;
             let dy = top + y as f32 - record.v;
             let shift = record.slope * dy;
             let along = record.along * dy * dy;
@@ -221,42 +219,70 @@ fn unblend_splat<const FMA: bool>(input: &TileInput, cut: &Cut, scratch: &mut Un
             else {
                 continue;
             };
-            let mut g = [0.0; WIDTH];
+            let mut g = *g_alpha;
+            let mut beyond = [0.0; WIDTH];
             for l in 0..WIDTH {
-                g[l] = fma::<FMA>(g_depth[l], cut.depth - depth[l], g_alpha[l]);
+                beyond[l] = cut.depth - depth[l];
             }
-            for ((plane, &feature), sum) in g_features.iter().zip(features).zip(feature_sums.iter_mut()) {
-                let Some(plane) = eight(plane, strip) else { continue };
-                for l in 0..WIDTH {
-                    g[l] = fma::<FMA>(plane[l], feature, g[l]);
-                    sum[l] = fma::<FMA>(step.weight[l], plane[l], sum[l]);
-                }
+            add::<FMA>(&mut g, g_depth, &beyond);
+            for (plane, &feature) in g_features.iter().zip(features) {
+                let Some(plane) = eight(plane, strip) else { break };
+                add::<FMA>(&mut g, plane, &[feature; WIDTH]);
             }
-            let mut h = [0.0; WIDTH];
+            for (plane, sum) in g_features.iter().zip(feature_sums.iter_mut()) {
+                let Some(plane) = eight(plane, strip) else { break };
+                add::<FMA>(sum, plane, &step.weight);
+            }
             for l in 0..WIDTH {
                 g[l] -= behind[l];
-                behind[l] = fma::<FMA>(step.alpha[l], g[l], behind[l]);
             }
+            add::<FMA>(behind, &step.alpha, &g);
+            let (mut h, mut hq, mut hy) = ([0.0; WIDTH], [0.0; WIDTH], [0.0; WIDTH]);
             for l in 0..WIDTH {
                 h[l] = f32::from_bits((step.weight[l] * g[l]).to_bits() & step.free[l]);
-                // Pixels far from a long thin splat may have a `q` that is not finite.
-                q[l] = f32::from_bits(q[l].to_bits() & step.free[l]);
-                any[l] |= step.hit[l];
             }
             for l in 0..WIDTH {
-                let (hq, hy) = (h[l] * q[l], h[l] * dy);
-                m[Moment::One as usize][l] += h[l];
-                m[Moment::Q as usize][l] += hq;
-                m[Moment::Y as usize][l] += hy;
-                m[Moment::QQ as usize][l] = fma::<FMA>(hq, q[l], m[Moment::QQ as usize][l]);
-                m[Moment::QY as usize][l] = fma::<FMA>(hq, dy, m[Moment::QY as usize][l]);
-                m[Moment::YY as usize][l] = fma::<FMA>(hy, dy, m[Moment::YY as usize][l]);
-                m[Moment::Depth as usize][l] = fma::<FMA>(step.weight[l], g_depth[l], m[Moment::Depth as usize][l]);
+                // Pixels far from a long thin splat may have a `q` that is not finite.
+                q[l] = f32::from_bits(q[l].to_bits() & step.free[l]);
             }
+            for l in 0..WIDTH {
+                hq[l] = h[l] * q[l];
+            }
+            for l in 0..WIDTH {
+                hy[l] = h[l] * dy;
+            }
+            for l in 0..WIDTH {
+                any[l] |= step.hit[l];
+            }
+            let [one, m_q, m_y, m_qq, m_qy, m_yy, m_depth] = &mut m;
+            for l in 0..WIDTH {
+                one[l] += h[l];
+            }
+            for l in 0..WIDTH {
+                m_q[l] += hq[l];
+            }
+            for l in 0..WIDTH {
+                m_y[l] += hy[l];
+            }
+            add::<FMA>(m_qq, &hq, &q);
+            add::<FMA>(m_qy, &hq, &[dy; WIDTH]);
+            add::<FMA>(m_yy, &hy, &[dy; WIDTH]);
+            add::<FMA>(m_depth, &step.weight, g_depth);
         }
     }
     scratch.sums[..MOMENTS].copy_from_slice(&m);
     any.iter().fold(0, |a, b| a | b) != 0
+}
+
+/// `sum += a * b` per lane. One operation per loop and no reading after the first write: what the compiler turns into
+/// vectors.
+#[inline(always)]
+fn add<const FMA: bool>(sum: &mut [f32; WIDTH], a: &[f32; WIDTH], b: &[f32; WIDTH]) {
+    let mut total = [0.0; WIDTH];
+    for l in 0..WIDTH {
+        total[l] = fma::<FMA>(a[l], b[l], sum[l]);
+    }
+    *sum = total;
 }
 
 /// Eight pixels of a row.
@@ -297,10 +323,15 @@ fn unshade(falloff: &[f32; WIDTH], after: &[f32; WIDTH], opacity: f32, alpha_cap
     }
     for l in 0..WIDTH {
         alpha[l] = f32::from_bits(alpha[l].to_bits() & hit[l]);
+    }
+    for l in 0..WIDTH {
         free[l] &= hit[l];
     }
     for l in 0..WIDTH {
-        before[l] = after[l] / (1.0 - alpha[l]);
+        before[l] = 1.0 - alpha[l];
+    }
+    for l in 0..WIDTH {
+        before[l] = after[l] / before[l];
     }
     for l in 0..WIDTH {
         weight[l] = alpha[l] * before[l];
