@@ -2,6 +2,7 @@
 
 mod conventions;
 mod degenerate;
+mod differences;
 mod golden;
 mod gradients;
 mod properties;
