@@ -145,7 +145,7 @@ fn gradients_beside_an_off_centre_picture_follow_each_convention() {
 #[test]
 fn gradients_hold_where_opaque_splats_fill_the_pixels() {
     let mut scene = smooth_scene(15, 20, 3);
-    scene.scales.iter_mut().flatten().for_each(|s| *s *= 12.0);
+    scene.scales.iter_mut().flatten().for_each(|s| *s *= 40.0);
     scene.opacities.iter_mut().for_each(|o| *o = 0.85 + 0.1 * *o);
     let views = [front_view(40, 24), turned_view(24, 20, 0.2)];
     let pictures = CpuRasterizer::new(RasterSettings::default()).unwrap().render(&scene.splats(), &views).unwrap();
