@@ -9,7 +9,7 @@ use std::cell::RefCell;
 
 use rayon::prelude::*;
 
-use super::pack::Shape;
+use super::pack::{Head, Shape};
 use super::{Output, tile};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
@@ -70,46 +70,6 @@ struct Task<'a> {
     head: usize,
     scratch: &'a mut Scratch,
     out: Output,
-}
-
-/// Rows `(token, channel)` of one head inside a wider matrix.
-#[derive(Clone, Copy)]
-struct Head<'a> {
-    values: &'a [f32],
-    first: usize,
-    stride: usize,
-    dim: usize,
-    tokens: usize,
-}
-
-impl Head<'_> {
-    #[inline(always)]
-    fn row(&self, token: usize) -> &[f32] {
-        &self.values[self.first + token * self.stride..][..self.dim]
-    }
-
-    /// Panels of `width` tokens, each channel by channel; tokens past the end are zeros.
-    #[inline(always)]
-    fn across(&self, width: usize, scale: f32, to: &mut [f32]) {
-        let panel = self.dim * width;
-        to[self.tokens / width * panel..].fill(0.0);
-        for t in 0..self.tokens {
-            let to = &mut to[t / width * panel + t % width..];
-            for (c, x) in self.row(t).iter().enumerate() {
-                to[c * width] = x * scale;
-            }
-        }
-    }
-
-    /// Panels of `width` channels, each token by token, `room` tokens to a panel.
-    #[inline(always)]
-    fn along(&self, width: usize, room: usize, to: &mut [f32]) {
-        for t in 0..self.tokens {
-            for (p, part) in self.row(t).chunks(width).enumerate() {
-                to[(p * room + t) * width..][..part.len()].copy_from_slice(part);
-            }
-        }
-    }
 }
 
 /// `sums[row] += sum_p a[p][row] b[p]` for `rows` rows and all channel panels: `a` at `p * a_step + row * a_row`, `b` and

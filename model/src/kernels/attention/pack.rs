@@ -97,3 +97,43 @@ impl Source<'_> {
         }
     }
 }
+
+/// Rows `(token, channel)` of one head inside a wider matrix.
+#[derive(Clone, Copy)]
+pub(super) struct Head<'a> {
+    pub(super) values: &'a [f32],
+    pub(super) first: usize,
+    pub(super) stride: usize,
+    pub(super) dim: usize,
+    pub(super) tokens: usize,
+}
+
+impl Head<'_> {
+    #[inline(always)]
+    pub(super) fn row(&self, token: usize) -> &[f32] {
+        &self.values[self.first + token * self.stride..][..self.dim]
+    }
+
+    /// Panels of `width` tokens, each channel by channel; tokens past the end are zeros.
+    #[inline(always)]
+    pub(super) fn across(&self, width: usize, scale: f32, to: &mut [f32]) {
+        let panel = self.dim * width;
+        to[self.tokens / width * panel..].fill(0.0);
+        for t in 0..self.tokens {
+            let to = &mut to[t / width * panel + t % width..];
+            for (c, x) in self.row(t).iter().enumerate() {
+                to[c * width] = x * scale;
+            }
+        }
+    }
+
+    /// Panels of `width` channels, each token by token, `room` tokens to a panel.
+    #[inline(always)]
+    pub(super) fn along(&self, width: usize, room: usize, to: &mut [f32]) {
+        for t in 0..self.tokens {
+            for (p, part) in self.row(t).chunks(width).enumerate() {
+                to[(p * room + t) * width..][..part.len()].copy_from_slice(part);
+            }
+        }
+    }
+}
