@@ -1,4 +1,4 @@
-//! Milliseconds to render the load of one step: 460,800 pixel-aligned Gaussians (12 images of 160x240: three cameras at
+//! Milliseconds to render the load of one step, and to take its gradients: 460,800 pixel-aligned Gaussians (12 images of 160x240: three cameras at
 //! four times along a straight drive) into three 160x240 views.
 //!
 //! `cargo run --release -p storm-render --example raster_speed [repeats] [yaw_deg]`; `yaw_deg` is the angle between
@@ -8,7 +8,9 @@ use glam::{Affine3A, Mat3, Quat, Vec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;
-use storm_render::raster::{CpuRasterizer, Picture, RasterSettings, Splats};
+use storm_render::raster::{
+    CpuRasterizer, Picture, PictureGradient, RasterError, RasterSettings, SplatGradients, Splats,
+};
 use storm_render::{Intrinsics, View};
 
 const WIDTH: usize = 240;
@@ -70,6 +72,28 @@ fn cpu_ms() -> Option<f64> {
     Some((ticks(11)? + ticks(12)?) * TICK_MS)
 }
 
+/// Runs `work` once and then `repeats` times; the times of the repeats, in words.
+fn measure(repeats: usize, mut work: impl FnMut() -> Result<(), RasterError>) -> Result<String, RasterError> {
+    let mut times_ms = Vec::new();
+    let mut cpu_start = None;
+    for repeat in 0..=repeats {
+        if repeat == 1 {
+            cpu_start = cpu_ms();
+        }
+        let start = Instant::now();
+        work()?;
+        times_ms.push(start.elapsed().as_secs_f64() * 1e3);
+    }
+    let cpu = cpu_start.zip(cpu_ms()).map_or(f64::NAN, |(from, to)| (to - from) / repeats as f64);
+    let first_ms = times_ms.remove(0);
+    times_ms.sort_by(f64::total_cmp);
+    Ok(format!(
+        "median {:.1} ms, best {:.1} ms, first {first_ms:.1} ms, processor time {cpu:.0} ms",
+        times_ms.get(times_ms.len() / 2).copied().unwrap_or(first_ms),
+        times_ms.first().copied().unwrap_or(first_ms),
+    ))
+}
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let repeats: usize = std::env::args().nth(1).map_or(Ok(15), |a| a.parse())?;
     let yaw_deg: f32 = std::env::args().nth(2).map_or(Ok(50.0), |a| a.parse())?;
@@ -89,24 +113,27 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         };
         let mut rasterizer = CpuRasterizer::new(RasterSettings::default())?;
         let mut pictures: Vec<Picture> = Vec::new();
-        let mut times_ms = Vec::new();
-        let mut cpu_start = None;
-        for repeat in 0..=repeats {
-            if repeat == 1 {
-                cpu_start = cpu_ms();
-            }
-            let start = Instant::now();
+        let forward = measure(repeats, || rasterizer.render_into(&splats, &views, &mut pictures))?;
+        println!("{channels:2} channels: forward {forward}");
+        let mut values = |n: usize| (0..n).map(|_| rng.random_range(-1.0f32..1.0)).collect::<Vec<_>>();
+        let upstream: Vec<PictureGradient> = pictures
+            .iter()
+            .map(|p| PictureGradient {
+                features: values(p.features.len()),
+                alpha: values(p.alpha.len()),
+                depth: values(p.depth.len()),
+            })
+            .collect();
+        let mut gradients = SplatGradients::default();
+        let both = measure(repeats, || {
             rasterizer.render_into(&splats, &views, &mut pictures)?;
-            times_ms.push(start.elapsed().as_secs_f64() * 1e3);
-        }
-        let cpu = cpu_start.zip(cpu_ms()).map_or(f64::NAN, |(from, to)| (to - from) / repeats as f64);
-        let first_ms = times_ms.remove(0);
-        times_ms.sort_by(f64::total_cmp);
+            rasterizer.backward_into(&splats, &views, &pictures, &upstream, &mut gradients)
+        })?;
+        let touched = gradients.opacities.iter().filter(|&&x| x != 0.0).count();
         let covered = pictures.iter().flat_map(|p| &p.alpha).filter(|&&a| a > 0.99).count();
+        println!("             with backward {both}; {touched} Gaussians have a gradient");
         println!(
-            "{channels:2} channels: median {:.1} ms, best {:.1} ms, first {first_ms:.1} ms, processor time {cpu:.0} ms; {:?}; {:.0}% of pixels opaque",
-            times_ms.get(times_ms.len() / 2).copied().unwrap_or(first_ms),
-            times_ms.first().copied().unwrap_or(first_ms),
+            "             {:?}; {:.0}% of pixels opaque",
             rasterizer.stats(),
             100.0 * covered as f64 / (3 * WIDTH * HEIGHT) as f64,
         );

@@ -3,40 +3,16 @@
 
 use super::settings::{ALPHA_FLOOR, ALPHA_MIN, TRANSMITTANCE_STOP};
 use super::simd::{dispatch, exp2_neg_lanes, fma, prefetch};
-use super::sort::{key_depth, key_slot};
-use super::tiles::{Chunk, ChunkView, Record, TILE_H, TILE_W};
+use super::tile::{
+    BATCH, Cut, EDGE, Finished, LINE_FLOATS, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, low_bits, mask,
+    prefetch_records,
+};
+use super::tiles::{TILE_H, TILE_W};
 
-/// Pixels blended together.
-const WIDTH: usize = 8;
-/// Row pitch of the tile's buffers: a sweep may begin at the last pixel and run into the padding.
-const PITCH: usize = TILE_W + WIDTH;
 /// Channels every picture has: `sum(w)` and `sum(w z)`.
 const BASE_PLANES: usize = 2;
-/// Splats fetched together, so that their cache misses overlap.
-const BATCH: usize = 32;
-/// Numbers in a cache line.
-const LINE_FLOATS: usize = 16;
 /// Sign bit of an f32.
 const SIGN: u32 = 1 << 31;
-
-/// A tile and the splats it shows.
-pub(crate) struct TileInput<'a> {
-    /// Top left pixel.
-    pub(crate) x0: usize,
-    pub(crate) y0: usize,
-    /// Size inside the picture, pixels.
-    pub(crate) width: usize,
-    pub(crate) height: usize,
-    /// Nearest first.
-    pub(crate) keys: &'a [u64],
-    pub(crate) chunks: &'a [Chunk],
-    /// log2 of the slots of a chunk.
-    pub(crate) chunk_bits: u32,
-    pub(crate) view: usize,
-    pub(crate) features: &'a [f32],
-    pub(crate) feature_count: usize,
-    pub(crate) alpha_cap: f32,
-}
 
 /// The part of one picture row that a tile owns.
 pub(crate) struct RowOut<'a> {
@@ -44,22 +20,6 @@ pub(crate) struct RowOut<'a> {
     pub(crate) alpha: &'a mut [f32],
     pub(crate) depth: &'a mut [f32],
 }
-
-/// A splat cut to a tile.
-#[derive(Clone, Copy)]
-struct Cut {
-    record: Record,
-    depth: f32,
-    id: u32,
-    /// Box inside the tile.
-    x0: usize,
-    x1: usize,
-    y0: usize,
-    y1: usize,
-}
-
-/// A row of one plane.
-type Row = [f32; PITCH];
 
 /// Buffers of one tile, reused.
 pub(crate) struct Scratch {
@@ -72,11 +32,10 @@ pub(crate) struct Scratch {
     /// Splats to blend now, and those to blend next.
     batch: Vec<Cut>,
     fetched: Vec<Cut>,
+    finished: Vec<Finished>,
     /// For sorting.
     pub(crate) spare_keys: Vec<u64>,
 }
-
-const _: () = assert!(TILE_W == u32::BITS as usize, "a row of a tile is one u32 of live pixels");
 
 impl Scratch {
     pub(crate) fn new() -> Self {
@@ -86,6 +45,7 @@ impl Scratch {
             live: [0; TILE_H],
             batch: Vec::with_capacity(BATCH),
             fetched: Vec::with_capacity(BATCH),
+            finished: Vec::new(),
             spare_keys: Vec::new(),
         }
     }
@@ -93,12 +53,18 @@ impl Scratch {
     fn reset(&mut self, width: usize, height: usize, planes: usize) {
         self.sums.clear();
         self.sums.resize(TILE_H * planes, [0.0; PITCH]);
+        self.finished.clear();
         for y in 0..TILE_H {
             let row_width = if y < height { width.min(TILE_W) } else { 0 };
             self.live[y] = low_bits(row_width);
             self.transmittance[y][..row_width].fill(1.0);
             self.transmittance[y][row_width..].fill(0.0);
         }
+    }
+
+    /// Keeps how the tile ended.
+    pub(crate) fn keep(&self, end: &mut TileEnd) {
+        end.keep(&self.transmittance, &self.finished);
     }
 
     /// Writes the tile into its rows of the picture.
@@ -121,12 +87,6 @@ impl Scratch {
     }
 }
 
-/// The `count` lowest bits; all of them from 32 on.
-#[inline(always)]
-fn low_bits(count: usize) -> u32 {
-    if count >= 32 { u32::MAX } else { (1 << count) - 1 }
-}
-
 dispatch!(
     /// Blends the splats of a tile into `scratch`.
     blend_tile, blend_tile_kernel, (input: &TileInput<'_>, scratch: &mut Scratch)
@@ -142,14 +102,15 @@ fn blend_tile_kernel<const FMA: bool>(input: &TileInput, scratch: &mut Scratch) 
     // While one batch is blended, the next has its features on the way and the one after that its records.
     prefetch_records(input, batch(0));
     prefetch_records(input, batch(1));
-    fetch(input, batch(0), scratch);
+    fetch(input, 0, batch(0), scratch);
     for index in 0..input.keys.len().div_ceil(BATCH) {
         std::mem::swap(&mut scratch.batch, &mut scratch.fetched);
         prefetch_records(input, batch(index + 2));
-        fetch(input, batch(index + 1), scratch);
-        for cut in &scratch.batch {
-            if is_live(&scratch.live, cut) {
-                blend_splat::<FMA>(input, cut, &mut scratch.transmittance, &mut scratch.sums, &mut scratch.live);
+        fetch(input, (index + 1) * BATCH, batch(index + 1), scratch);
+        let Scratch { transmittance, sums, live, finished, batch, .. } = &mut *scratch;
+        for cut in batch.iter() {
+            if is_live(live, cut) {
+                blend_splat::<FMA>(input, cut, transmittance, sums, live, finished);
             }
         }
         if scratch.live.iter().fold(0, |a, b| a | b) == 0 {
@@ -158,46 +119,12 @@ fn blend_tile_kernel<const FMA: bool>(input: &TileInput, scratch: &mut Scratch) 
     }
 }
 
-/// True when a pixel of the box is unfinished.
-#[inline(always)]
-fn is_live(live: &[u32; TILE_H], cut: &Cut) -> bool {
-    let columns = low_bits(cut.x1 - cut.x0) << cut.x0;
-    live[cut.y0..cut.y1].iter().fold(0, |a, b| a | b) & columns != 0
-}
-
-/// The chunk and the position in it that a key stands for.
-#[inline(always)]
-fn locate<'a>(input: &TileInput<'a>, key: u64) -> (&'a ChunkView, usize) {
-    let slot = key_slot(key);
-    (&input.chunks[slot >> input.chunk_bits].views[input.view], slot & ((1 << input.chunk_bits) - 1))
-}
-
-/// Asks for the records and ids of a batch.
-#[inline(always)]
-fn prefetch_records(input: &TileInput, keys: &[u64]) {
-    for &key in keys {
-        let (view, at) = locate(input, key);
-        prefetch(&view.records, at);
-        prefetch(&view.ids, at);
-    }
-}
-
 /// Reads the records of a batch, keeps the splats that may still add something, and asks for their features.
 #[inline(always)]
-fn fetch(input: &TileInput, keys: &[u64], scratch: &mut Scratch) {
+fn fetch(input: &TileInput, first: usize, keys: &[u64], scratch: &mut Scratch) {
     scratch.fetched.clear();
-    for &key in keys {
-        let (view, at) = locate(input, key);
-        let record = view.records[at];
-        let cut = Cut {
-            record,
-            depth: key_depth(key),
-            id: view.ids[at],
-            x0: usize::from(record.x0).max(input.x0) - input.x0,
-            x1: usize::from(record.x1).min(input.x0 + input.width) - input.x0,
-            y0: usize::from(record.y0).max(input.y0) - input.y0,
-            y1: usize::from(record.y1).min(input.y0 + input.height) - input.y0,
-        };
+    for (offset, &key) in keys.iter().enumerate() {
+        let cut = Cut::new(input, first + offset, key);
         if is_live(&scratch.live, &cut) {
             let first = cut.id as usize * input.feature_count;
             for at in (first..first + input.feature_count).step_by(LINE_FLOATS) {
@@ -208,21 +135,6 @@ fn fetch(input: &TileInput, keys: &[u64], scratch: &mut Scratch) {
     }
 }
 
-/// `0` for the lanes below the index, infinity from there on.
-const EDGE: [[f32; WIDTH]; WIDTH + 1] = {
-    let mut table = [[f32::INFINITY; WIDTH]; WIDTH + 1];
-    let mut columns = 0;
-    while columns <= WIDTH {
-        let mut l = 0;
-        while l < columns {
-            table[columns][l] = 0.0;
-            l += 1;
-        }
-        columns += 1;
-    }
-    table
-};
-
 /// Blends one splat, strip by strip of eight columns.
 #[inline(always)]
 fn blend_splat<const FMA: bool>(
@@ -231,6 +143,7 @@ fn blend_splat<const FMA: bool>(
     transmittance: &mut [Row; TILE_H],
     sums: &mut [Row],
     live: &mut [u32; TILE_H],
+    done: &mut Vec<Finished>,
 ) {
     let record = &cut.record;
     let features = &input.features[cut.id as usize * input.feature_count..][..input.feature_count];
@@ -272,7 +185,7 @@ fn blend_splat<const FMA: bool>(
             }
         }
         if finished.iter().fold(0, |a, b| a | b) != 0 {
-            retire(live, transmittance, cut.y0..cut.y1, strip);
+            retire(live, done, transmittance, cut, strip);
         }
     }
 }
@@ -300,7 +213,7 @@ struct Step {
 #[inline(always)]
 fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap: f32) -> Step {
     let (mut alpha, mut hit, mut weight) = ([0.0f32; WIDTH], [0u32; WIDTH], [0.0f32; WIDTH]);
-    let (mut after, mut finished) = ([0.0f32; WIDTH], [0u32; WIDTH]);
+    let (mut passed, mut after, mut finished) = ([0.0f32; WIDTH], [0.0f32; WIDTH], [0u32; WIDTH]);
     for l in 0..WIDTH {
         alpha[l] = opacity * falloff[l];
     }
@@ -313,8 +226,13 @@ fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap:
     for l in 0..WIDTH {
         weight[l] = f32::from_bits((alpha[l] * before[l]).to_bits() & hit[l]);
     }
+    // Not `before - weight`: behind an alpha near 1 little more than its rounding would be left, and the backward pass
+    // divides the same factor out again.
     for l in 0..WIDTH {
-        after[l] = before[l] - weight[l];
+        passed[l] = 1.0 - f32::from_bits(alpha[l].to_bits() & hit[l]);
+    }
+    for l in 0..WIDTH {
+        after[l] = before[l] * passed[l];
     }
     for l in 0..WIDTH {
         finished[l] = mask(after[l] <= TRANSMITTANCE_STOP) & hit[l];
@@ -330,19 +248,17 @@ fn shade(falloff: &[f32; WIDTH], before: &[f32; WIDTH], opacity: f32, alpha_cap:
     Step { weight, after, finished }
 }
 
-/// All ones or 0.
-#[inline(always)]
-fn mask(condition: bool) -> u32 {
-    0u32.wrapping_sub(u32::from(condition))
-}
-
-/// Clears the live bits of the pixels a strip has finished.
+/// Clears the live bits of the pixels a strip has finished, and notes them.
 #[cold]
 #[inline(never)]
-fn retire(live: &mut [u32; TILE_H], transmittance: &[Row; TILE_H], rows: std::ops::Range<usize>, strip: usize) {
-    for (bits, row) in live[rows.clone()].iter_mut().zip(&transmittance[rows]) {
-        for (x, &t) in row.iter().enumerate().skip(strip).take(WIDTH.min(TILE_W - strip)) {
-            *bits &= !(u32::from(t < 0.0) << x);
+fn retire(live: &mut [u32; TILE_H], done: &mut Vec<Finished>, transmittance: &[Row; TILE_H], cut: &Cut, strip: usize) {
+    for y in cut.y0..cut.y1 {
+        for (x, &t) in transmittance[y].iter().enumerate().skip(strip).take(WIDTH.min(TILE_W - strip)) {
+            let bit = 1 << x;
+            if t < 0.0 && live[y] & bit != 0 {
+                live[y] &= !bit;
+                done.push(Finished { position: cut.position, x: x as u8, y: y as u8 });
+            }
         }
     }
 }

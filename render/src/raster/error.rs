@@ -43,4 +43,10 @@ pub enum RasterError {
         /// What is wrong, the value and the fix.
         what: String,
     },
+    /// A backward pass that does not belong to the last render.
+    #[error("the last render drew {what}; call `render` with these Gaussians and views before `backward`")]
+    NotRendered {
+        /// What it drew instead.
+        what: &'static str,
+    },
 }

@@ -1,32 +1,42 @@
-//! Splatting: forward rasterisation of 3D Gaussians on the CPU, by the rules of gsplat (see [`Convention`]).
+//! Splatting: rasterisation of 3D Gaussians on the CPU and its gradients, by the rules of gsplat (see [`Convention`]).
 //!
 //! The data's way: `scene` (checked input) -> `project` (ellipses of eight Gaussians at a time, for all views) ->
 //! `tiles` (each chunk lists its splats by tile) -> `sort` (depth order per tile) -> `blend` (front to back) ->
-//! [`Picture`]. [`reference`](mod@reference) is the slow, obvious version all of it is tested against.
+//! [`Picture`]; and back: [`PictureGradient`] -> `unblend` (back to front) -> `unproject` -> [`SplatGradients`], from
+//! there to velocities by [`VelocityGradients`]. [`reference`](mod@reference) is the slow, obvious version all of it is tested against.
 
+mod backward;
 mod blend;
 mod error;
+mod motion;
 mod project;
 pub mod reference;
 mod scene;
 mod settings;
 mod simd;
 mod sort;
+mod tile;
 mod tiles;
+mod unblend;
+mod unproject;
 
 #[cfg(test)]
 mod tests;
 
+pub use backward::{MAX_PAIR_SUMS, PictureGradient, SplatGradients};
 pub use error::RasterError;
+pub use motion::VelocityGradients;
 pub use scene::{MAX_FEATURES, MAX_PICTURE_VALUES, MAX_SIDE, MAX_SPLATS, MAX_VIEWS, Picture, RasterStats, Splats};
+use settings::ALPHA_FLOOR;
 pub use settings::{ALPHA_MIN, Convention, RasterSettings, TILE_RULE, TRANSMITTANCE_STOP};
 
 use crate::camera::View;
-use blend::{RowOut, Scratch, TileInput, blend_tile};
+use blend::{RowOut, Scratch, blend_tile};
 use project::{Block, Camera, Footprints, LANES, Rules};
 use rayon::prelude::*;
 use simd::Isa;
 use std::sync::atomic::AtomicUsize;
+use tile::{TileEnd, TileInput};
 use tiles::{Chunk, ChunkInput, Grid, TILE_H, TILE_W, fill_chunk};
 
 /// Most entries of all tile lists together (2 GiB of keys).
@@ -36,14 +46,32 @@ const MIN_CHUNK_BITS: u32 = 12;
 /// Chunks grow with the number of Gaussians so that there are about this many at most.
 const MAX_CHUNKS: usize = 256;
 
-/// The forward rasteriser; owns its buffers, so that a stream of pictures allocates only once.
+/// The rasteriser; owns its buffers, so that a stream of pictures allocates only once.
 pub struct CpuRasterizer {
     settings: RasterSettings,
     isa: Isa,
     chunks: Vec<Chunk>,
-    /// Sorted keys per tile, all views; kept after `render` for a backward pass.
-    lists: Vec<Vec<u64>>,
+    /// Per tile, all views; kept after `render` for a backward pass.
+    tiles: Vec<TileMemory>,
+    /// What the last successful `render` drew.
+    rendered: Option<Rendered>,
     stats: RasterStats,
+}
+
+/// What is kept of a tile.
+#[derive(Default)]
+struct TileMemory {
+    /// Sorted list.
+    keys: Vec<u64>,
+    end: TileEnd,
+}
+
+/// The request that the kept lists belong to.
+struct Rendered {
+    views: Vec<View>,
+    splats: usize,
+    feature_count: usize,
+    chunk_bits: u32,
 }
 
 /// A Gaussian as one view sees it.
@@ -64,7 +92,7 @@ impl CpuRasterizer {
     pub fn new(settings: RasterSettings) -> Result<Self, RasterError> {
         settings.validate()?;
         let isa = Isa::detect();
-        Ok(Self { settings, isa, chunks: Vec::new(), lists: Vec::new(), stats: RasterStats::default() })
+        Ok(Self { settings, isa, chunks: Vec::new(), tiles: Vec::new(), rendered: None, stats: RasterStats::default() })
     }
 
     /// The settings in use.
@@ -99,6 +127,7 @@ impl CpuRasterizer {
     ) -> Result<(), RasterError> {
         splats.validate()?;
         scene::validate_views(views, splats.feature_count)?;
+        self.rendered = None;
         let grid = Grid::new(views.iter().map(|v| (v.intrinsics.width, v.intrinsics.height)));
         let (chunk_bits, stats) = self.fill_chunks(splats, views, &grid)?;
         self.stats = stats;
@@ -107,6 +136,8 @@ impl CpuRasterizer {
             picture.resize(view.intrinsics.width, view.intrinsics.height, splats.feature_count);
         }
         self.blend(splats, &grid, chunk_bits, pictures);
+        let (n, feature_count) = (splats.len(), splats.feature_count);
+        self.rendered = Some(Rendered { views: views.to_vec(), splats: n, feature_count, chunk_bits });
         Ok(())
     }
 
@@ -160,16 +191,17 @@ impl CpuRasterizer {
 
     /// Sorts and blends every tile.
     fn blend(&mut self, splats: &Splats, grid: &Grid, chunk_bits: u32, pictures: &mut [Picture]) {
-        self.lists.resize_with(grid.tile_count(), Vec::new);
+        self.tiles.resize_with(grid.tile_count(), TileMemory::default);
         let mut jobs: Vec<TileJob> = Vec::with_capacity(grid.tile_count());
         for (view, picture) in pictures.iter_mut().enumerate() {
             push_jobs(view, picture, &mut jobs);
         }
         let (chunks, isa) = (&self.chunks, self.isa);
         let alpha_cap = self.settings.convention.alpha_cap();
-        jobs.par_iter_mut().zip(&mut self.lists).enumerate().for_each_init(
+        jobs.par_iter_mut().zip(&mut self.tiles).enumerate().for_each_init(
             Scratch::new,
-            |scratch, (tile, (job, keys))| {
+            |scratch, (tile, (job, memory))| {
+                let keys = &mut memory.keys;
                 keys.clear();
                 for chunk in chunks {
                     keys.extend_from_slice(chunk.tile_keys(tile));
@@ -189,6 +221,7 @@ impl CpuRasterizer {
                     alpha_cap,
                 };
                 blend_tile(isa, &input, scratch);
+                scratch.keep(&mut memory.end);
                 scratch.write(&mut job.rows, splats.feature_count);
             },
         );

@@ -26,14 +26,14 @@ const HALF_LOG2_E: f64 = 0.5 * std::f64::consts::LOG2_E;
 /// A view made ready: f64, with the clamps of the Jacobian.
 #[derive(Debug, Clone)]
 pub(crate) struct Camera {
-    rotation: [[f64; 3]; 3],
-    translation: [f64; 3],
-    focal: [f64; 2],
+    pub(crate) rotation: [[f64; 3]; 3],
+    pub(crate) translation: [f64; 3],
+    pub(crate) focal: [f64; 2],
     center: [f64; 2],
     size: [f64; 2],
     /// Smallest and largest x/z and y/z at which the Jacobian is taken.
-    clamp_min: [f64; 2],
-    clamp_max: [f64; 2],
+    pub(crate) clamp_min: [f64; 2],
+    pub(crate) clamp_max: [f64; 2],
     /// Bound on `z^2 |J|^2`.
     jacobian_bound: f64,
 }
@@ -89,9 +89,9 @@ impl From<&RasterSettings> for Rules {
 /// Eight Gaussians, independent of any view.
 #[derive(Debug, Clone)]
 pub(crate) struct Block {
-    mean: [Lane; 3],
+    pub(crate) mean: [Lane; 3],
     /// `R S`, row-major.
-    axes: [[Lane; 3]; 3],
+    pub(crate) axes: [[Lane; 3]; 3],
     /// Largest squared scale.
     size2: Lane,
     /// `2 ln(255 o)`: squared standard deviations at which alpha falls to 1/255; negative when it never reaches it.

@@ -206,32 +206,50 @@ fn project_one(settings: &RasterSettings, splats: &Splats, view: &View, id: usiz
     if too_small || !inside_x || !inside_y {
         return None;
     }
-    // The order of the fast version: z rounded to f32, then index.
-    let depth = f64::from(z as f32);
-    Some(Ellipse { id, mean: [u, v], conic: [c / det, -b / det, a / det], depth, radius, exact_radius, opacity })
+    Some(Ellipse { id, mean: [u, v], conic: [c / det, -b / det, a / det], depth: z, radius, exact_radius, opacity })
+}
+
+/// A view's picture before it is rounded to f32.
+pub(super) struct ExactPicture {
+    pub(super) features: Vec<f64>,
+    pub(super) alpha: Vec<f64>,
+    pub(super) depth: Vec<f64>,
+    pub(super) fragile: Vec<bool>,
 }
 
 fn render_view(settings: &RasterSettings, splats: &Splats, view: &View) -> (Picture, Vec<bool>) {
-    let mut ellipses: Vec<Ellipse> = (0..splats.len()).filter_map(|i| project_one(settings, splats, view, i)).collect();
-    ellipses.sort_by(|p, q| p.depth.total_cmp(&q.depth).then(p.id.cmp(&q.id)));
+    let exact = render_exact(settings, splats, view);
     let mut picture = Picture::default();
     picture.resize(view.intrinsics.width, view.intrinsics.height, splats.feature_count);
-    let mut fragile = vec![false; picture.alpha.len()];
+    let round = |to: &mut [f32], from: &[f64], low: f32, high: f32| {
+        for (to, from) in to.iter_mut().zip(from) {
+            *to = from.clamp(f64::from(low), f64::from(high)) as f32;
+        }
+    };
+    round(&mut picture.features, &exact.features, f32::MIN, f32::MAX);
+    round(&mut picture.alpha, &exact.alpha, 0.0, 1.0);
+    round(&mut picture.depth, &exact.depth, 0.0, f32::MAX);
+    (picture, exact.fragile)
+}
+
+/// Renders checked input in f64; what finite differences are taken of.
+pub(super) fn render_exact(settings: &RasterSettings, splats: &Splats, view: &View) -> ExactPicture {
+    let mut ellipses: Vec<Ellipse> = (0..splats.len()).filter_map(|i| project_one(settings, splats, view, i)).collect();
+    // The order of the fast version: z rounded to f32, then index.
+    ellipses.sort_by(|p, q| (p.depth as f32).total_cmp(&(q.depth as f32)).then(p.id.cmp(&q.id)));
+    let (width, height) = (view.intrinsics.width, view.intrinsics.height);
+    let mut picture = ExactPicture { features: vec![], alpha: vec![], depth: vec![], fragile: vec![] };
     let mut sums = vec![0.0; splats.feature_count];
-    for row in 0..picture.height {
-        for col in 0..picture.width {
-            let pixel = row * picture.width + col;
-            let (weight, weighted_depth, is_fragile) = blend_pixel(settings, splats, &ellipses, col, row, &mut sums);
-            picture.alpha[pixel] = weight.min(1.0) as f32;
-            picture.depth[pixel] = (weighted_depth / weight.max(f64::from(ALPHA_FLOOR))) as f32;
-            let out = &mut picture.features[pixel * splats.feature_count..][..splats.feature_count];
-            for (o, s) in out.iter_mut().zip(&sums) {
-                *o = s.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32;
-            }
-            fragile[pixel] = is_fragile;
+    for row in 0..height {
+        for col in 0..width {
+            let (weight, weighted_depth, fragile) = blend_pixel(settings, splats, &ellipses, col, row, &mut sums);
+            picture.features.extend_from_slice(&sums);
+            picture.alpha.push(weight);
+            picture.depth.push(weighted_depth / weight.max(f64::from(ALPHA_FLOOR)));
+            picture.fragile.push(fragile);
         }
     }
-    (picture, fragile)
+    picture
 }
 
 /// `sum(w)`, `sum(w z)` and fragility of one pixel; `sums` receives `sum(w f)`.

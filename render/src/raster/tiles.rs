@@ -7,7 +7,7 @@ use super::sort::key;
 use super::{MAX_PAIRS, Splats};
 use bytemuck::{Pod, Zeroable};
 use std::ops::Range;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 
 /// Tile width, pixels: wide enough that few splats are listed twice.
 pub(crate) const TILE_W: usize = 32;
@@ -33,6 +33,20 @@ pub(crate) struct Record {
     pub(crate) y0: u16,
     pub(crate) x1: u16,
     pub(crate) y1: u16,
+}
+
+impl Record {
+    /// Columns of tiles the box meets.
+    #[inline(always)]
+    fn tile_columns(&self) -> Range<usize> {
+        usize::from(self.x0) / TILE_W..usize::from(self.x1).div_ceil(TILE_W)
+    }
+
+    /// Rows of tiles the box meets.
+    #[inline(always)]
+    fn tile_rows(&self) -> Range<usize> {
+        usize::from(self.y0) / TILE_H..usize::from(self.y1).div_ceil(TILE_H)
+    }
 }
 
 /// Where the tiles of each view stand in the list of all tiles.
@@ -75,8 +89,8 @@ impl GridView {
     /// Calls `visit` with the index of every tile the box of `record` meets.
     #[inline(always)]
     fn each_tile(&self, record: &Record, mut visit: impl FnMut(usize)) {
-        let columns = usize::from(record.x0) / TILE_W..usize::from(record.x1).div_ceil(TILE_W);
-        for row in usize::from(record.y0) / TILE_H..usize::from(record.y1).div_ceil(TILE_H) {
+        let columns = record.tile_columns();
+        for row in record.tile_rows() {
             let first = self.first + row * self.columns;
             for column in columns.clone() {
                 visit(first + column);
@@ -93,6 +107,10 @@ pub(crate) struct ChunkView {
     pub(crate) depths: Vec<f32>,
     /// Index of the Gaussian.
     pub(crate) ids: Vec<u32>,
+    /// Backward pass: where the pairs of each record start; one more entry than records.
+    pair_starts: Vec<u32>,
+    /// Backward pass: one row of sums per (record, tile) pair, tiles in the order of the grid.
+    sums: Vec<AtomicU32>,
 }
 
 /// One chunk of consecutive Gaussians: its splats per view and its keys per tile.
@@ -211,6 +229,39 @@ fn all_finite(values: &[f32]) -> bool {
 }
 
 impl ChunkView {
+    /// Makes a row of `row_len` zeros for every (record, tile) pair.
+    pub(crate) fn clear_sums(&mut self, row_len: usize) {
+        self.pair_starts.clear();
+        let mut pairs = 0;
+        for record in &self.records {
+            self.pair_starts.push(pairs);
+            pairs += record.tile_columns().len() as u32 * record.tile_rows().len() as u32;
+        }
+        self.pair_starts.push(pairs);
+        self.sums.clear();
+        self.sums.resize_with(pairs as usize * row_len, AtomicU32::default);
+    }
+
+    /// The row of sums of record `at` in the tile at `(column, row)` of the view.
+    #[inline(always)]
+    pub(crate) fn pair_sums(&self, at: usize, column: usize, row: usize, row_len: usize) -> Option<&[AtomicU32]> {
+        let record = self.records.get(at)?;
+        let columns = record.tile_columns();
+        let tile = (row - record.tile_rows().start) * columns.len() + (column - columns.start);
+        let pair = *self.pair_starts.get(at)? as usize + tile;
+        self.sums.get(pair * row_len..(pair + 1) * row_len)
+    }
+
+    /// The rows of sums of all pairs of record `at`, one after the other.
+    pub(crate) fn record_sums(&self, at: usize, row_len: usize) -> &[AtomicU32] {
+        match (self.pair_starts.get(at), self.pair_starts.get(at + 1)) {
+            (Some(&from), Some(&to)) => {
+                self.sums.get(from as usize * row_len..to as usize * row_len).unwrap_or_default()
+            }
+            _ => &[],
+        }
+    }
+
     /// Keeps the visible lanes that have a pixel to blend; returns how many lanes are visible.
     #[inline(always)]
     fn keep(&mut self, block: &Block, prints: &Footprints, splats: &Splats, start: usize) -> usize {

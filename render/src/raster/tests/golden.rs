@@ -18,17 +18,17 @@ const PROJECTION_TOLERANCE: f32 = 1e-6;
 type Render = fn(&RasterSettings, &Splats, &[View]) -> Result<Vec<Picture>, RasterError>;
 const FAST: Render = |settings, splats, views| CpuRasterizer::new(*settings)?.render(splats, views);
 
-struct Golden {
+pub(super) struct Golden {
     bytes: Vec<u8>,
 }
 
 impl Golden {
-    fn open(name: &str) -> Self {
+    pub(super) fn open(name: &str) -> Self {
         let path = format!("{}/../tests/fixtures/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
         Self { bytes: std::fs::read(path).unwrap() }
     }
 
-    fn f32s(&self, name: &str) -> Vec<f32> {
+    pub(super) fn f32s(&self, name: &str) -> Vec<f32> {
         let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
         let tensor = tensors.tensor(name).unwrap();
         assert_eq!(tensor.dtype(), safetensors::Dtype::F32, "{name}");
@@ -40,24 +40,32 @@ impl Golden {
         tensors.tensor(name).unwrap().data().as_chunks::<4>().0.iter().map(|&b| i32::from_le_bytes(b)).collect()
     }
 
-    fn u8s(&self, name: &str) -> Vec<u8> {
+    pub(super) fn u8s(&self, name: &str) -> Vec<u8> {
         SafeTensors::deserialize(&self.bytes).unwrap().tensor(name).unwrap().data().to_vec()
     }
 
-    fn rows<const N: usize>(&self, name: &str) -> Vec<[f32; N]> {
+    pub(super) fn rows<const N: usize>(&self, name: &str) -> Vec<[f32; N]> {
         self.f32s(name).as_chunks::<N>().0.to_vec()
     }
 
-    fn view(&self) -> View {
-        let m = self.f32s("viewmats");
-        let k = self.f32s("Ks");
-        let rotation = Mat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
-        let translation = Vec3::new(m[3], m[7], m[11]);
-        let intrinsics = Intrinsics { fx: k[0], fy: k[4], cx: k[2], cy: k[5], width: 96, height: 64 };
-        View { camera_from_world: Affine3A::from_mat3_translation(rotation, translation), intrinsics }
+    /// Every camera, with pictures of this size.
+    pub(super) fn views(&self, width: usize, height: usize) -> Vec<View> {
+        let (poses, cameras) = (self.f32s("viewmats"), self.f32s("Ks"));
+        let pairs = poses.as_chunks::<16>().0.iter().zip(cameras.as_chunks::<9>().0);
+        let view = |(m, k): (&[f32; 16], &[f32; 9])| {
+            let rotation = Mat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
+            let translation = Vec3::new(m[3], m[7], m[11]);
+            let intrinsics = Intrinsics { fx: k[0], fy: k[4], cx: k[2], cy: k[5], width, height };
+            View { camera_from_world: Affine3A::from_mat3_translation(rotation, translation), intrinsics }
+        };
+        pairs.map(view).collect()
     }
 
-    fn with_splats<R>(&self, run: impl FnOnce(&Splats) -> R) -> R {
+    fn view(&self) -> View {
+        self.views(96, 64)[0]
+    }
+
+    pub(super) fn with_splats<R>(&self, run: impl FnOnce(&Splats) -> R) -> R {
         let (means, quats, scales) = (self.rows("means"), self.rows("quats"), self.rows("scales"));
         let (opacities, colors) = (self.f32s("opacities"), self.f32s("colors"));
         run(&Splats {
@@ -66,7 +74,7 @@ impl Golden {
             scales: &scales,
             opacities: &opacities,
             features: &colors,
-            feature_count: 3,
+            feature_count: colors.len() / means.len(),
         })
     }
 }

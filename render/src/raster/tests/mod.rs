@@ -3,5 +3,6 @@
 mod conventions;
 mod degenerate;
 mod golden;
+mod gradients;
 mod properties;
 mod scenes;
