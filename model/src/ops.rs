@@ -1,18 +1,23 @@
 //! The operations the network is written in. Each picks the kernel where one covers the device and type, else the
 //! plain candle version in [`crate::plain`].
 //!
-//! Kernels ([`crate::kernels`]) take f32 tensors on the CPU that are not part of a gradient's graph; tensors that do not
-//! lie in row-major order are copied first. Everything else goes to [`crate::plain`]: other types (f64, f16, bf16), other
-//! devices, and whatever candle must differentiate (a variable, or a tensor computed from one). For inference with
-//! weights that are variables, detach them once (`Tensor::detach`) when the model is loaded.
+//! Kernels ([`crate::kernels`]) take f32 tensors on the CPU; tensors that do not lie in row-major order are copied first.
+//! Tensors that carry gradients (a variable, or a tensor computed from one) take the same kernels and become nodes of
+//! candle's graph, whose `backward` runs kernels too. Other types (f64, f16, bf16) and devices go to [`crate::plain`].
+//!
+//! Gradients are first order: the gradient of a gradient is not tracked. Inference with weights that are variables packs
+//! them at every use and keeps what a backward pass would need: detach them once (`Tensor::detach`) when the model is
+//! loaded for inference alone.
+
+mod graph;
+mod training;
 
 use std::sync::{Arc, OnceLock};
 
 use candle_core::{D, Result, Tensor, TensorId};
 
 use crate::kernels::gemm::{self, Epilogue, PackedWeight};
-use crate::kernels::math::Function;
-use crate::kernels::tensors::{covered, with_optional, with_values};
+use crate::kernels::tensors::{covered, tracked, with_optional, with_values};
 use crate::kernels::{self, Isa};
 use crate::plain;
 
@@ -20,7 +25,8 @@ use crate::plain;
 ///
 /// The kernel's layout of the weight is made at first use and shared by clones (it doubles the layer's memory). It
 /// belongs to this `weight` tensor: replacing the field is noticed, but writing into the storage of a tensor detached
-/// from a variable is not, so make a new `Linear` after such a change.
+/// from a variable is not, so make a new `Linear` after such a change. For a weight that carries gradients nothing is
+/// kept: an optimiser's step in place is seen by the next use.
 #[derive(Debug, Clone)]
 pub struct Linear {
     /// `(out, in)`.
@@ -39,7 +45,7 @@ impl Linear {
     /// Makes the kernel's layout now, so that the first step is not slower than the others. Nothing to do for weights
     /// the kernels do not cover.
     pub fn prepare(&self) -> Result<()> {
-        match covered([&self.weight]) {
+        match covered([&self.weight]) && !self.weight.track_op() {
             true => self.with_packed(|_| Ok(())),
             false => Ok(()),
         }
@@ -51,6 +57,9 @@ impl Linear {
     }
 
     fn with_packed<R>(&self, f: impl FnOnce(&PackedWeight) -> Result<R>) -> Result<R> {
+        if self.weight.track_op() {
+            return f(&self.pack()?);
+        }
         let id = self.weight.id();
         if self.packed.get().is_none() {
             // Two threads may both get here; the first to finish wins and the other's work is dropped.
@@ -96,6 +105,9 @@ pub fn attention(qkv: &Tensor, heads: usize) -> Result<Tensor> {
         return plain::attention(qkv, heads);
     }
     let shape = kernels::attention::Shape { batch, tokens, heads, head_dim: d3 / 3 / heads };
+    if qkv.track_op() {
+        return training::attention(qkv, shape);
+    }
     let mut out = vec![0f32; batch * tokens * d3 / 3];
     with_values(qkv, |values| {
         kernels::attention::attention(Isa::detect(), values, shape, &mut out);
@@ -121,6 +133,9 @@ pub fn linear(x: &Tensor, layer: &Linear, act: Activation, residual: Option<&Ten
     let inputs = [Some(x), Some(&layer.weight), layer.bias.as_ref(), residual];
     if !same_shape || x.elem_count() == 0 || n == 0 || !covered(inputs.into_iter().flatten()) {
         return plain::linear(x, layer, act, residual);
+    }
+    if tracked(inputs.into_iter().flatten()) {
+        return training::linear(x, layer, act, residual, &dims);
     }
     let mut out = vec![0f32; dims.iter().product()];
     with_values(x, |x| {
@@ -149,6 +164,9 @@ pub fn mlp(x: &Tensor, first: &Linear, act: Activation, second: &Linear, residua
         && residual.is_none_or(|r| r.dims() == dims);
     if !fits || x.elem_count() == 0 || second.weight.elem_count() == 0 || !covered(inputs.into_iter().flatten()) {
         return linear(&linear(x, first, act, None)?, second, Activation::None, residual);
+    }
+    if tracked(inputs.into_iter().flatten()) {
+        return training::mlp(x, first, act, second, residual, &dims);
     }
     let mut out = vec![0f32; dims.iter().product()];
     with_values(x, |x| {
@@ -179,6 +197,9 @@ pub fn layer_norm(x: &Tensor, weight: Option<&Tensor>, bias: Option<&Tensor>, ep
     if x.elem_count() == 0 || !covered([Some(x), weight, bias].into_iter().flatten()) {
         return plain::layer_norm(x, weight, bias, eps);
     }
+    if tracked([Some(x), weight, bias].into_iter().flatten()) {
+        return training::layer_norm(x, weight, bias, eps);
+    }
     let mut out = vec![0f32; x.elem_count()];
     with_values(x, |x| {
         with_optional(weight, |weight| {
@@ -194,7 +215,7 @@ pub fn layer_norm(x: &Tensor, weight: Option<&Tensor>, bias: Option<&Tensor>, ep
 /// Exact (erf) GELU of every element.
 pub fn gelu(x: &Tensor) -> Result<Tensor> {
     match covered([x]) {
-        true => map(x, Function::Gelu),
+        true => map(x, Activation::Gelu),
         false => x.gelu_erf(),
     }
 }
@@ -202,15 +223,18 @@ pub fn gelu(x: &Tensor) -> Result<Tensor> {
 /// `x * sigmoid(x)` of every element.
 pub fn silu(x: &Tensor) -> Result<Tensor> {
     match covered([x]) {
-        true => map(x, Function::Silu),
+        true => map(x, Activation::Silu),
         false => x.silu(),
     }
 }
 
-fn map(x: &Tensor, function: Function) -> Result<Tensor> {
+fn map(x: &Tensor, act: Activation) -> Result<Tensor> {
+    if x.track_op() {
+        return training::map(x, act);
+    }
     let mut out = vec![0f32; x.elem_count()];
     with_values(x, |values| {
-        kernels::rows::map(Isa::detect(), function, values, &mut out);
+        kernels::rows::activate(Isa::detect(), act, values, None, &mut out);
         Ok(())
     })?;
     Tensor::from_vec(out, x.dims(), x.device())
@@ -222,6 +246,9 @@ pub fn softmax(x: &Tensor, tau: f64) -> Result<Tensor> {
     if x.elem_count() == 0 || !covered([x]) {
         return plain::softmax(x, tau);
     }
+    if x.track_op() {
+        return training::softmax(x, tau);
+    }
     let mut out = vec![0f32; x.elem_count()];
     with_values(x, |values| {
         kernels::rows::softmax(Isa::detect(), values, width, tau as f32, &mut out);
@@ -231,140 +258,6 @@ pub fn softmax(x: &Tensor, tau: f64) -> Result<Tensor> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use candle_core::{DType, Device, Var};
-    use proptest::prelude::*;
-
-    /// Kernel and plain version sum in different orders: a few roundings of results of a few units.
-    const TOLERANCE: f32 = 2e-5;
-
-    fn noise(seed: u64, dims: &[usize], scale: f32) -> Tensor {
-        let values = crate::kernels::tests::noise(seed, dims.iter().product(), scale);
-        Tensor::from_vec(values, dims, &Device::Cpu).unwrap()
-    }
-
-    #[track_caller]
-    fn same(a: &Tensor, b: &Tensor) {
-        assert_eq!(a.dims(), b.dims());
-        let worst = (a - b).unwrap().abs().unwrap().flatten_all().unwrap().max(0).unwrap();
-        let worst = worst.to_dtype(DType::F32).unwrap().to_scalar::<f32>().unwrap();
-        assert!(worst < TOLERANCE, "{worst:e}");
-    }
-
-    fn layer(seed: u64, n: usize, k: usize, bias: bool) -> Linear {
-        Linear::new(noise(seed, &[n, k], (k as f32).powf(-0.5)), bias.then(|| noise(seed + 1, &[n], 0.5)))
-    }
-
-    proptest! {
-        #![proptest_config(ProptestConfig::with_cases(24))]
-
-        #[test]
-        fn attention_is_the_plain_one(
-            b in 1usize..3, n in 1usize..140, heads in 1usize..4, d in 1usize..40, seed in 0u64..1000,
-        ) {
-            let qkv = noise(seed, &[b, n, 3 * heads * d], 2.0);
-            same(&attention(&qkv, heads).unwrap(), &plain::attention(&qkv, heads).unwrap());
-        }
-
-        #[test]
-        fn linear_is_the_plain_one(
-            b in 1usize..3, m in 1usize..120, n in 1usize..70, k in 1usize..300, seed in 0u64..1000,
-            bias: bool, add: bool, act in 0usize..3,
-        ) {
-            let (x, layer) = (noise(seed, &[b, m, k], 1.0), layer(seed + 1, n, k, bias));
-            let act = [Activation::None, Activation::Gelu, Activation::Silu][act];
-            let residual = add.then(|| noise(seed + 3, &[b, m, n], 1.0));
-            let got = linear(&x, &layer, act, residual.as_ref()).unwrap();
-            same(&got, &plain::linear(&x, &layer, act, residual.as_ref()).unwrap());
-            // Again, now with the weight packed.
-            let again = linear(&x, &layer, act, residual.as_ref()).unwrap();
-            prop_assert_eq!(got.flatten_all().unwrap().to_vec1::<f32>().unwrap(),
-                again.flatten_all().unwrap().to_vec1::<f32>().unwrap());
-        }
-
-        #[test]
-        fn mlp_is_two_layers(m in 1usize..60, k in 1usize..40, h in 1usize..90, n in 1usize..40, add: bool, seed in 0u64..1000) {
-            let x = noise(seed, &[2, m, k], 1.0);
-            let (one, two) = (layer(seed + 1, h, k, true), layer(seed + 3, n, h, add));
-            let residual = add.then(|| noise(seed + 5, &[2, m, n], 1.0));
-            let got = mlp(&x, &one, Activation::Gelu, &two, residual.as_ref()).unwrap();
-            let between = plain::linear(&x, &one, Activation::Gelu, None).unwrap();
-            same(&got, &plain::linear(&between, &two, Activation::None, residual.as_ref()).unwrap());
-        }
-
-        #[test]
-        fn rows_are_the_plain_ones(m in 1usize..50, n in 1usize..200, seed in 0u64..1000, learned: bool) {
-            let x = noise(seed, &[2, m, n], 3.0);
-            let (w, b) = (noise(seed + 1, &[n], 1.0), noise(seed + 2, &[n], 1.0));
-            let (w, b) = (learned.then_some(&w), learned.then_some(&b));
-            // A single column, or nearly equal values, divides rounding by rounding: a usual eps keeps it apart.
-            same(&layer_norm(&x, w, b, 1e-3).unwrap(), &plain::layer_norm(&x, w, b, 1e-3).unwrap());
-            same(&softmax(&x, 0.5).unwrap(), &plain::softmax(&x, 0.5).unwrap());
-            same(&gelu(&x).unwrap(), &x.gelu_erf().unwrap());
-            same(&silu(&x).unwrap(), &x.silu().unwrap());
-        }
-    }
-
-    #[test]
-    fn any_layout_and_type() {
-        let x = noise(1, &[40, 2, 30], 1.0).transpose(0, 1).unwrap();
-        let layer = layer(2, 24, 30, true);
-        assert!(!x.is_contiguous());
-        same(
-            &linear(&x, &layer, Activation::Gelu, None).unwrap(),
-            &plain::linear(&x, &layer, Activation::Gelu, None).unwrap(),
-        );
-        let narrow = noise(3, &[1, 50, 24], 1.0).narrow(1, 7, 20).unwrap();
-        same(&layer_norm(&narrow, None, None, 1e-6).unwrap(), &plain::layer_norm(&narrow, None, None, 1e-6).unwrap());
-        let qkv = noise(4, &[1, 33, 48], 1.0);
-        let wide = attention(&qkv.to_dtype(DType::F64).unwrap(), 2).unwrap();
-        assert_eq!(wide.dtype(), DType::F64);
-        same(&attention(&qkv, 2).unwrap(), &wide.to_dtype(DType::F32).unwrap());
-        let transposed = Linear::new(noise(5, &[30, 24], 0.2).t().unwrap(), None);
-        same(
-            &linear(&x, &transposed, Activation::None, None).unwrap(),
-            &plain::linear(&x, &transposed, Activation::None, None).unwrap(),
-        );
-    }
-
-    #[test]
-    fn gradients_still_flow() {
-        let w = Var::from_tensor(&noise(1, &[8, 6], 1.0)).unwrap();
-        let x = noise(2, &[5, 6], 1.0);
-        let layer = Linear::new(w.as_tensor().clone(), None);
-        layer.prepare().unwrap();
-        let y = linear(&x, &layer, Activation::Gelu, None).unwrap();
-        let y = softmax(&layer_norm(&y, None, None, 1e-6).unwrap(), 0.5).unwrap();
-        let grads = y.sqr().unwrap().sum_all().unwrap().backward().unwrap();
-        assert!(grads.get(&w).is_some());
-        // An optimiser's step in place is seen at once.
-        let before = linear(&x, &layer, Activation::None, None).unwrap();
-        w.set(&(w.as_tensor() * 2.0).unwrap()).unwrap();
-        same(&linear(&x, &layer, Activation::None, None).unwrap(), &(before * 2.0).unwrap());
-    }
-
-    #[test]
-    fn a_replaced_weight_is_noticed() {
-        let x = noise(1, &[5, 6], 1.0);
-        let mut layer = layer(2, 8, 6, false);
-        let before = linear(&x, &layer, Activation::None, None).unwrap();
-        layer.weight = (&layer.weight * 3.0).unwrap();
-        same(&linear(&x, &layer, Activation::None, None).unwrap(), &(before * 3.0).unwrap());
-    }
-
-    #[test]
-    fn wrong_shapes_are_errors() {
-        let x = noise(1, &[5, 6], 1.0);
-        assert!(linear(&x, &layer(2, 8, 7, false), Activation::None, None).is_err());
-        let wrong_bias = Linear::new(noise(1, &[8, 6], 1.0), Some(noise(1, &[7], 1.0)));
-        assert!(linear(&x, &wrong_bias, Activation::None, None).is_err());
-        assert!(linear(&x, &layer(2, 8, 6, false), Activation::None, Some(&noise(3, &[5, 7], 1.0))).is_err());
-        assert!(mlp(&x, &layer(2, 8, 6, true), Activation::None, &layer(3, 4, 9, true), None).is_err());
-        assert!(mlp(&x, &layer(2, 8, 7, true), Activation::None, &layer(3, 4, 8, true), None).is_err());
-        assert!(mlp(&x, &layer(2, 8, 6, true), Activation::None, &layer(3, 4, 8, true), Some(&x)).is_err());
-        assert!(attention(&noise(1, &[1, 5, 6], 1.0), 4).is_err());
-        assert!(attention(&noise(1, &[1, 5, 6], 1.0), 0).is_err());
-        assert!(layer_norm(&x, Some(&noise(1, &[5], 1.0)), None, 1e-6).is_err());
-    }
-}
+mod gradient_tests;
+#[cfg(test)]
+mod tests;

@@ -67,6 +67,46 @@ pub(crate) fn silu<S: Simd>(x: S::V) -> S::V {
     S::mul(x, S::div(numerator, S::add(S::splat(1.0), e)))
 }
 
+/// Past this many standard deviations the normal density (under 1e-43) is taken as zero.
+const DENSITY_END: f32 = 14.0;
+
+/// [`gelu`] and its derivative, `Phi(x) + x phi(x)`.
+#[inline(always)]
+fn gelu_and_slope<S: Simd>(x: S::V) -> (S::V, S::V) {
+    let u = S::abs(x);
+    let h = S::mul(S::splat(0.5), two_tails::<S>(u));
+    let below = S::select_lt(x, S::zero(), h, S::sub(S::splat(1.0), h));
+    let exponent = S::mul(S::mul(u, u), S::splat(-0.5 * std::f32::consts::LOG2_E));
+    // 1 / sqrt(2 pi).
+    let density =
+        S::mul(S::splat(0.5 * std::f32::consts::FRAC_2_SQRT_PI * std::f32::consts::FRAC_1_SQRT_2), exp2::<S>(exponent));
+    let moment = S::select_lt(S::splat(DENSITY_END), u, S::zero(), S::mul(x, density));
+    (S::mul(x, below), S::add(below, moment))
+}
+
+/// [`silu`] and its derivative, `s + x s (1 - s)` for the sigmoid `s`.
+#[inline(always)]
+fn silu_and_slope<S: Simd>(x: S::V) -> (S::V, S::V) {
+    let e = exp2::<S>(S::mul(S::abs(x), S::splat(-std::f32::consts::LOG2_E)));
+    let inverse = S::div(S::splat(1.0), S::add(S::splat(1.0), e));
+    let small = S::mul(e, inverse);
+    // Both the sigmoid and one less it are had without subtracting.
+    let s = S::select_lt(x, S::zero(), small, inverse);
+    let rest = S::select_lt(x, S::zero(), inverse, small);
+    let value = S::mul(x, s);
+    (value, S::mul_add(value, rest, s))
+}
+
+/// The activation and its derivative.
+#[inline(always)]
+pub(crate) fn activate_and_slope<S: Simd>(act: Activation, x: S::V) -> (S::V, S::V) {
+    match act {
+        Activation::None => (x, S::splat(1.0)),
+        Activation::Gelu => gelu_and_slope::<S>(x),
+        Activation::Silu => silu_and_slope::<S>(x),
+    }
+}
+
 /// `erf(x)`; absolute error under 1e-7.
 #[inline(always)]
 fn erf<S: Simd>(x: S::V) -> S::V {
@@ -134,6 +174,66 @@ impl Kernel for Map<'_> {
     }
 }
 
+struct Slope<'a> {
+    act: Activation,
+    x: &'a [f32],
+    grad: &'a mut [f32],
+    value: Option<&'a mut [f32]>,
+}
+
+impl Kernel for Slope<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<S: Simd, const MR: usize>(self) {
+        let Slope { act, x, grad, mut value } = self;
+        let whole = x.len() / S::W * S::W;
+        for at in (0..whole).step_by(S::W) {
+            // SAFETY: `at + W <= whole`, the length of none of the slices is under it.
+            unsafe {
+                let (v, slope) = activate_and_slope::<S>(act, S::load(x.as_ptr().add(at)));
+                let to = grad.as_mut_ptr().add(at);
+                S::store(to, S::mul(S::load(to), slope));
+                if let Some(value) = &mut value {
+                    S::store(value.as_mut_ptr().add(at), v);
+                }
+            }
+        }
+        let rest = x.len() - whole;
+        if rest > 0 {
+            let (mut lanes, mut values, mut slopes) = ([0f32; 16], [0f32; 16], [0f32; 16]);
+            lanes[..rest].copy_from_slice(&x[whole..]);
+            // SAFETY: no vector has more than 16 lanes.
+            unsafe {
+                let (v, slope) = activate_and_slope::<S>(act, S::load(lanes.as_ptr()));
+                S::store(values.as_mut_ptr(), v);
+                S::store(slopes.as_mut_ptr(), slope);
+            }
+            grad[whole..].iter_mut().zip(slopes).for_each(|(g, s)| *g *= s);
+            if let Some(value) = value {
+                value[whole..].copy_from_slice(&values[..rest]);
+            }
+        }
+    }
+}
+
+/// `grad *= act'(x)` element by element on this thread, and `value = act(x)` where that is wanted.
+///
+/// Panics when the lengths disagree.
+pub fn backward(isa: Isa, act: Activation, x: &[f32], grad: &mut [f32], value: Option<&mut [f32]>) {
+    assert!(grad.len() == x.len() && value.as_ref().is_none_or(|v| v.len() == x.len()), "{} values", x.len());
+    dispatch(isa, Slope { act, x, grad, value });
+}
+
+/// Applies the activation of a linear layer in place, on this thread.
+pub fn activation(isa: Isa, act: Activation, values: &mut [f32]) {
+    match act {
+        Activation::None => {}
+        Activation::Gelu => apply(isa, Function::Gelu, values),
+        Activation::Silu => apply(isa, Function::Silu, values),
+    }
+}
+
 /// Applies `function` in place, on this thread.
 pub fn apply(isa: Isa, function: Function, values: &mut [f32]) {
     dispatch(isa, Map { function, values });
@@ -189,6 +289,43 @@ mod tests {
             assert!(edge[2].is_nan());
             assert_eq!(edge[3], 1.0);
             assert_eq!(edge[4], f32::MIN_POSITIVE);
+        }
+    }
+
+    #[test]
+    fn slopes_follow_their_definitions() {
+        /// Slopes of at most 1.13: three roundings of terms of that size.
+        const SLOPE_TOLERANCE: f64 = 4e-7;
+        /// The value beside the slope may be multiplied in another order than [`activate`]'s: a few roundings.
+        const VALUE_RELATIVE: f32 = 4e-7;
+        for isa in Isa::tested() {
+            for act in [Activation::Gelu, Activation::Silu] {
+                let xs = grid(-16.0, 16.0, 100_003);
+                let (mut slopes, mut values) = (vec![1f32; xs.len()], vec![0f32; xs.len()]);
+                backward(isa, act, &xs, &mut slopes, Some(&mut values));
+                let mut forward = xs.clone();
+                let function = if act == Activation::Gelu { Function::Gelu } else { Function::Silu };
+                apply(isa, function, &mut forward);
+                let mut worst = 0f64;
+                for ((&x, &slope), (&value, &want)) in xs.iter().zip(&slopes).zip(values.iter().zip(&forward)) {
+                    assert!((value - want).abs() <= VALUE_RELATIVE * want.abs(), "{isa:?} {act:?} {x}: {value} {want}");
+                    let x = f64::from(x);
+                    let s = 1.0 / (1.0 + (-x).exp());
+                    let exact = match act {
+                        Activation::Gelu => {
+                            let density = (-0.5 * x * x).exp() / (2.0 * std::f64::consts::PI).sqrt();
+                            0.5 * (1.0 + erf64(x / 2f64.sqrt())) + x * density
+                        }
+                        _ => s + x * s * (1.0 - s),
+                    };
+                    worst = worst.max((f64::from(slope) - exact).abs());
+                }
+                println!("{isa:?} {act:?} slope: worst absolute error {worst:.2e}");
+                assert!(worst < SLOPE_TOLERANCE, "{isa:?} {act:?} {worst:e}");
+                let mut edge = [1.0; 3];
+                backward(isa, act, &[1e30, -1e30, f32::NAN], &mut edge, None);
+                assert!(edge[0] == 1.0 && edge[1].abs() < 1e-6 && edge[2].is_nan(), "{isa:?} {act:?} {edge:?}");
+            }
         }
     }
 

@@ -8,7 +8,7 @@
 //! Every sum is taken in an order fixed by the shapes and the instruction set alone, so results have the same bits for
 //! any number of threads. Between instruction sets they differ by rounding.
 //!
-//! Forward only: [`crate::ops`] sends tensors that carry gradients to [`crate::plain`].
+//! Backward passes take what the forward pass kept; [`crate::ops`] puts both into candle's gradient graph.
 
 mod aligned;
 pub mod attention;

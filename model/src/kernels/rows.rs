@@ -3,20 +3,12 @@
 use rayon::prelude::*;
 
 use super::Isa;
-use super::math::{Function, apply, exp2};
+use super::math::{activation, backward, exp2};
 use super::simd::{Kernel, Simd, dispatch};
+use crate::ops::Activation;
 
 /// Elements a task works on at least.
 const TASK_FLOATS: usize = 16 * 1024;
-
-/// `out = f(x)`, element by element.
-pub fn map(isa: Isa, function: Function, x: &[f32], out: &mut [f32]) {
-    assert_eq!(x.len(), out.len());
-    out.par_chunks_mut(TASK_FLOATS).zip(x.par_chunks(TASK_FLOATS)).for_each(|(out, x)| {
-        out.copy_from_slice(x);
-        apply(isa, function, out);
-    });
-}
 
 struct Softmax<'a> {
     x: &'a [f32],
@@ -64,6 +56,72 @@ pub fn softmax(isa: Isa, x: &[f32], width: usize, tau: f32, out: &mut [f32]) {
     let scale = std::f32::consts::LOG2_E / tau;
     out.par_chunks_mut(task).zip(x.par_chunks(task)).for_each(|(out, x)| {
         dispatch(isa, Softmax { x, width, scale, out });
+    });
+}
+
+/// `out = act(x) + residual`, element by element.
+///
+/// Panics when the lengths disagree.
+pub fn activate(isa: Isa, act: Activation, x: &[f32], residual: Option<&[f32]>, out: &mut [f32]) {
+    assert!(x.len() == out.len() && residual.is_none_or(|r| r.len() == x.len()), "{} values", x.len());
+    out.par_chunks_mut(TASK_FLOATS).zip(x.par_chunks(TASK_FLOATS)).enumerate().for_each(|(i, (out, x))| {
+        out.copy_from_slice(x);
+        activation(isa, act, out);
+        if let Some(residual) = residual {
+            out.iter_mut().zip(&residual[i * TASK_FLOATS..]).for_each(|(o, r)| *o += r);
+        }
+    });
+}
+
+/// `grad *= act'(x)`, element by element.
+///
+/// Panics when the lengths disagree.
+pub fn map_backward(isa: Isa, act: Activation, x: &[f32], grad: &mut [f32]) {
+    assert_eq!(x.len(), grad.len());
+    grad.par_chunks_mut(TASK_FLOATS).zip(x.par_chunks(TASK_FLOATS)).for_each(|(grad, x)| {
+        backward(isa, act, x, grad, None);
+    });
+}
+
+struct SoftmaxBackward<'a> {
+    y: &'a [f32],
+    width: usize,
+    scale: f32,
+    grad: &'a mut [f32],
+}
+
+impl Kernel for SoftmaxBackward<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<S: Simd, const MR: usize>(self) {
+        for (y, grad) in self.y.chunks_exact(self.width).zip(self.grad.chunks_exact_mut(self.width)) {
+            let whole = self.width / S::W * S::W;
+            let mut sums = S::zero();
+            for at in (0..whole).step_by(S::W) {
+                // SAFETY: `at + W <= whole`, and both rows are that long.
+                unsafe { sums = S::mul_add(S::load(y.as_ptr().add(at)), S::load(grad.as_ptr().add(at)), sums) };
+            }
+            let mut mean = S::sum(sums);
+            for at in whole..self.width {
+                mean += y[at] * grad[at];
+            }
+            grad.iter_mut().zip(y).for_each(|(g, y)| *g = y * (*g - mean) * self.scale);
+        }
+    }
+}
+
+/// The gradient of [`softmax`]'s input from its result `y`, in place of the result's gradient.
+///
+/// Panics when the lengths disagree.
+pub fn softmax_backward(isa: Isa, y: &[f32], width: usize, tau: f32, grad: &mut [f32]) {
+    if width == 0 {
+        return;
+    }
+    assert!(y.len() == grad.len() && y.len().is_multiple_of(width), "rows of {width}");
+    let task = (TASK_FLOATS / width).max(1) * width;
+    grad.par_chunks_mut(task).zip(y.par_chunks(task)).for_each(|(grad, y)| {
+        dispatch(isa, SoftmaxBackward { y, width, scale: 1.0 / tau, grad });
     });
 }
 

@@ -9,6 +9,7 @@
 //! Logits may be of any finite size: the largest so far is subtracted before the power is taken, so weights are at most
 //! 1 and the sum at least 1. A NaN in a query, key or value reaches every output that depends on it.
 
+mod backward;
 mod pack;
 
 use rayon::prelude::*;
@@ -20,6 +21,7 @@ use super::math::exp2;
 use super::simd::{Kernel, Simd, dispatch};
 use pack::{Layout, Source, pack};
 
+pub use backward::{Source as BackwardSource, attention_backward};
 pub use pack::Shape;
 
 /// Queries of a task: a multiple of both tile heights.
@@ -75,6 +77,8 @@ struct Task<'a> {
     blocks: &'a [f32],
     scratch: &'a mut Scratch,
     out: Output,
+    /// Log-sum-exp of each query's logits in units of log 2, `(batch, heads, tokens)`, where it is kept.
+    log_sums: Option<Output>,
 }
 
 impl Kernel for Task<'_> {
@@ -153,6 +157,11 @@ impl Kernel for Task<'_> {
             }
         }
 
+        if let Some(log_sums) = self.log_sums {
+            // SAFETY: batch, head and query block identify the task, so no other task writes these.
+            let to = unsafe { log_sums.row((batch * shape.heads + head) * shape.tokens + first, queries) };
+            to.iter_mut().zip(largest.iter().zip(&total)).for_each(|(to, (top, total))| *to = top + total.log2());
+        }
         for r in 0..queries {
             let at = (batch * shape.tokens + first + r) * shape.width() + head * d;
             // SAFETY: batch, head and query block identify the task, so no other task writes these columns of this row.
@@ -220,6 +229,21 @@ fn row_weights<S: Simd>(row: &mut [f32], top: f32) -> f32 {
 ///
 /// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
 pub fn attention(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) {
+    run(isa, qkv, shape, out, None);
+}
+
+/// As [`attention`]; also returns what [`attention_backward`] needs of each row: the log-sum-exp of its logits in units
+/// of log 2, `(batch, heads, tokens)`.
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
+pub fn attention_keeping(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) -> Vec<f32> {
+    let mut log_sums = vec![0f32; shape.batch * shape.tokens * shape.heads];
+    let to = Output { start: log_sums.as_mut_ptr(), len: log_sums.len() };
+    run(isa, qkv, shape, out, Some(to));
+    log_sums
+}
+
+fn run(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32], log_sums: Option<Output>) {
     let rows = shape.batch * shape.tokens;
     assert_eq!(qkv.len(), rows * 3 * shape.width(), "qkv of {shape:?}");
     assert_eq!(out.len(), rows * shape.width(), "output of {shape:?}");
@@ -242,7 +266,7 @@ pub fn attention(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) {
             let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
             let source = Source { qkv, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
             let blocks = &packed[head_index * head_floats..][..head_floats];
-            dispatch(isa, Task { source, layout: &layout, blocks, scratch, out: output });
+            dispatch(isa, Task { source, layout: &layout, blocks, scratch, out: output, log_sums });
         },
     );
 }

@@ -9,6 +9,7 @@
 //! Every output is summed in the order of `k`, in blocks fixed by `k` alone: neither the split over threads nor the
 //! row's place in `x` changes its bits.
 
+mod backward;
 mod pack;
 mod tile;
 
@@ -20,9 +21,10 @@ use super::Isa;
 use super::aligned::Aligned;
 use super::simd::{Kernel, Simd, dispatch};
 use crate::ops::Activation;
-use pack::{Depths, pack_rows};
+use pack::{Depths, pack_columns, pack_rows};
 use tile::finish;
 
+pub use backward::{Mlp, MlpGradients, column_sums, mlp_backward, mlp_keeping, weight_gradient};
 pub use pack::PackedWeight;
 pub(crate) use tile::tile;
 
@@ -63,10 +65,19 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
+/// The left-hand rows of a task.
+#[derive(Clone, Copy)]
+enum Rows<'a> {
+    /// As they are.
+    Lying(&'a [f32]),
+    /// Columns from `first` on of values with `stride` columns.
+    Standing { values: &'a [f32], stride: usize, first: usize },
+}
+
 /// One task: some rows of the output.
 struct Block<'a> {
     scratch: &'a mut BlockScratch,
-    x: &'a [f32],
+    x: Rows<'a>,
     w: &'a PackedWeight,
     epilogue: Epilogue<'a>,
     out: &'a mut [f32],
@@ -83,7 +94,10 @@ impl Kernel for Block<'_> {
         let m = self.out.len() / n;
         let row_panels = m.div_ceil(MR);
         let packed = self.scratch.packed.at_least(row_panels * MR * k);
-        pack_rows::<MR>(self.x, k, packed);
+        match self.x {
+            Rows::Lying(x) => pack_rows::<MR>(x, k, packed),
+            Rows::Standing { values, stride, first } => pack_columns::<MR>(values, stride, first, m, packed),
+        }
         let weights = self.w.data.as_slice();
         let block_panels = BLOCK_COLS / nr;
         let partial = self.scratch.partial.at_least(row_panels * MR * n.div_ceil(nr).min(block_panels) * nr);
@@ -172,7 +186,7 @@ pub fn linear(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, out: &mut [f3
         let epilogue = epilogue.part(i * rows * n, out.len());
         // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
         SCRATCH.with_borrow_mut(|scratch| {
-            dispatch(w.isa, Block { scratch: &mut scratch.blocks, x, w, epilogue, out });
+            dispatch(w.isa, Block { scratch: &mut scratch.blocks, x: Rows::Lying(x), w, epilogue, out });
         });
     });
 }
@@ -203,8 +217,9 @@ pub fn mlp(
         let second = second.part(i * rows * n, out.len());
         SCRATCH.with_borrow_mut(|Scratch { blocks, hidden: between }| {
             let between = between.at_least(count * hidden);
-            dispatch(w1.isa, Block { scratch: blocks, x, w: w1, epilogue: first, out: between });
-            dispatch(w2.isa, Block { scratch: blocks, x: between, w: w2, epilogue: second, out });
+            dispatch(w1.isa, Block { scratch: blocks, x: Rows::Lying(x), w: w1, epilogue: first, out: between });
+            let x = Rows::Lying(between);
+            dispatch(w2.isa, Block { scratch: blocks, x, w: w2, epilogue: second, out });
         });
     });
 }

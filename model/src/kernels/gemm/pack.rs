@@ -48,6 +48,30 @@ impl PackedWeight {
         Self { isa, n, k, data }
     }
 
+    /// Packs the transpose of row-major `values` `(k, n)`: the layer that goes back through a weight `(k, n)`, or a sum
+    /// over rows. `k > 0`.
+    pub fn transposed(isa: Isa, values: &[f32], n: usize, k: usize) -> Self {
+        let mut packed = Self { isa, n, k, data: Aligned::default() };
+        packed.pack_transposed(values, n, k);
+        packed
+    }
+
+    /// [`PackedWeight::transposed`] into the memory of an earlier one.
+    pub(super) fn pack_transposed(&mut self, values: &[f32], n: usize, k: usize) {
+        assert!(k > 0 && values.len() == n * k, "weight of {k} x {n}");
+        let nr = self.isa.tile_cols();
+        (self.n, self.k) = (n, k);
+        let panels = self.data.at_least(n.div_ceil(nr) * nr * k);
+        panels.par_chunks_mut(nr * k).enumerate().for_each(|(index, panel)| {
+            let first = index * nr;
+            let width = nr.min(n - first);
+            for (to, row) in panel.chunks_exact_mut(nr).zip(values.chunks_exact(n)) {
+                to[..width].copy_from_slice(&row[first..first + width]);
+                to[width..].fill(0.0);
+            }
+        });
+    }
+
     /// Outputs of the layer.
     pub fn outputs(&self) -> usize {
         self.n
@@ -77,6 +101,26 @@ pub(super) fn pack_rows<const MR: usize>(x: &[f32], k: usize, packed: &mut [f32]
                     panel[p * MR + r] = v;
                 }
             }
+        }
+    }
+}
+
+/// As [`pack_rows`], for rows that are columns `first..first + m` of row-major `x` with `stride` columns.
+#[inline(always)]
+pub(super) fn pack_columns<const MR: usize>(x: &[f32], stride: usize, first: usize, m: usize, packed: &mut [f32]) {
+    let k = x.len() / stride;
+    for (p, row) in x.chunks_exact(stride).enumerate() {
+        let row = &row[first..first + m];
+        let mut at = p * MR;
+        let mut panels = row.chunks_exact(MR);
+        for part in &mut panels {
+            packed[at..at + MR].copy_from_slice(part);
+            at += k * MR;
+        }
+        let rest = panels.remainder();
+        if !rest.is_empty() {
+            packed[at..at + MR].fill(0.0);
+            packed[at..at + rest.len()].copy_from_slice(rest);
         }
     }
 }

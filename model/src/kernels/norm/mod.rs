@@ -1,9 +1,13 @@
 //! Layer norm over rows: mean and variance in f64, so that rows far from zero lose nothing.
 
+mod backward;
+
 use rayon::prelude::*;
 
 use super::Isa;
 use super::simd::{Kernel, Simd, dispatch};
+
+pub use backward::{RowStatistics, Source, layer_norm_backward};
 
 /// Independent partial sums; fixed, so the statistics have the same bits on every instruction set.
 const LANES: usize = 8;
@@ -17,6 +21,8 @@ struct Rows<'a> {
     bias: Option<&'a [f32]>,
     eps: f64,
     out: &'a mut [f32],
+    /// One per row, where they are kept.
+    statistics: &'a mut [RowStatistics],
 }
 
 /// `sum f(x)` in f64 over [`LANES`] interleaved partial sums.
@@ -39,10 +45,14 @@ impl Kernel for Rows<'_> {
     #[inline(always)]
     fn run<S: Simd, const MR: usize>(self) {
         let n = self.width as f64;
-        for (x, out) in self.x.chunks_exact(self.width).zip(self.out.chunks_exact_mut(self.width)) {
+        let rows = self.x.chunks_exact(self.width).zip(self.out.chunks_exact_mut(self.width));
+        for (row, (x, out)) in rows.enumerate() {
             let mean = sum(x, |v| v) / n;
             let variance = sum(x, |v| (v - mean) * (v - mean)) / n;
             let scale = 1.0 / (variance + self.eps).sqrt();
+            if let Some(statistics) = self.statistics.get_mut(row) {
+                *statistics = RowStatistics::new(mean, scale);
+            }
             for (o, &v) in out.iter_mut().zip(x) {
                 *o = ((f64::from(v) - mean) * scale) as f32;
             }
@@ -68,6 +78,32 @@ pub fn layer_norm(
     eps: f64,
     out: &mut [f32],
 ) {
+    run(isa, x, width, (weight, bias, eps), out, &mut []);
+}
+
+/// As [`layer_norm`], keeping what [`layer_norm_backward`] needs of each row.
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes).
+pub fn layer_norm_keeping(
+    isa: Isa,
+    x: &[f32],
+    width: usize,
+    (weight, bias, eps): (Option<&[f32]>, Option<&[f32]>, f64),
+    out: &mut [f32],
+) -> Vec<RowStatistics> {
+    let mut statistics = vec![RowStatistics::default(); x.len().checked_div(width).unwrap_or(0)];
+    run(isa, x, width, (weight, bias, eps), out, &mut statistics);
+    statistics
+}
+
+fn run(
+    isa: Isa,
+    x: &[f32],
+    width: usize,
+    (weight, bias, eps): (Option<&[f32]>, Option<&[f32]>, f64),
+    out: &mut [f32],
+    statistics: &mut [RowStatistics],
+) {
     if width == 0 {
         return;
     }
@@ -76,9 +112,14 @@ pub fn layer_norm(
         weight.is_none_or(|w| w.len() == width) && bias.is_none_or(|b| b.len() == width),
         "gain and offset of {width}"
     );
-    let task = (TASK_FLOATS / width).max(1) * width;
-    out.par_chunks_mut(task).zip(x.par_chunks(task)).for_each(|(out, x)| {
-        dispatch(isa, Rows { x, width, weight, bias, eps, out });
+    let rows = (TASK_FLOATS / width).max(1);
+    let tasks = out.par_chunks_mut(rows * width).zip(x.par_chunks(rows * width));
+    if statistics.is_empty() {
+        return tasks
+            .for_each(|(out, x)| dispatch(isa, Rows { x, width, weight, bias, eps, out, statistics: &mut [] }));
+    }
+    tasks.zip(statistics.par_chunks_mut(rows)).for_each(|((out, x), statistics)| {
+        dispatch(isa, Rows { x, width, weight, bias, eps, out, statistics });
     });
 }
 

@@ -1,0 +1,419 @@
+//! Gradients of attention without the `n x n` matrix: the weights are computed again, block by block, from the queries,
+//! the keys and each row's log-sum-exp (Dao et al., "FlashAttention", 2022, appendix B).
+//!
+//! With `P` the weights, `O` the result, `G` its gradient: `D = rowsum(G o O)`, `dS = P o (G V^T - D)`, and then
+//! `dV = P^T G`, `dK = dS^T Q / sqrt(d)`, `dQ = dS K / sqrt(d)`. A task is one head of one sequence, so every sum has one
+//! owner and one order: key blocks outside, query blocks inside.
+
+use std::cell::RefCell;
+
+use rayon::prelude::*;
+
+use super::pack::Shape;
+use super::{Output, tile};
+use crate::kernels::Isa;
+use crate::kernels::aligned::Aligned;
+use crate::kernels::math::exp2;
+use crate::kernels::simd::{Kernel, Simd, dispatch};
+
+/// Queries and keys taken at a time: a multiple of every tile's sides. Two blocks of weights are 72 KiB.
+const BLOCK: usize = 96;
+
+/// Working memory of a thread. Parts that no value is packed into (past the last token or channel) only reach results
+/// that are not read.
+#[derive(Default)]
+struct Scratch {
+    /// Queries (scaled) and gradients of the result, in panels of tile rows.
+    query_rows: Aligned,
+    grad_rows: Aligned,
+    /// Keys and values, in panels of tile columns along the tokens.
+    key_columns: Aligned,
+    value_columns: Aligned,
+    /// Keys, queries and gradients of the result, in panels of tile columns along the channels.
+    keys: Aligned,
+    queries: Aligned,
+    grads: Aligned,
+    /// `D` of each query.
+    corrections: Aligned,
+    /// One block of `P` and of `dS`, queries by keys.
+    weights: Aligned,
+    logit_grads: Aligned,
+    /// Sums, in panels of tile columns along the channels: all queries, one block of keys.
+    query_sums: Aligned,
+    key_sums: Aligned,
+    value_sums: Aligned,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// What the gradients of one call are taken from.
+#[derive(Debug, Clone, Copy)]
+pub struct Source<'a> {
+    /// As in [`super::attention`].
+    pub qkv: &'a [f32],
+    /// Its result.
+    pub result: &'a [f32],
+    /// Log-sum-exp of each row's logits, `(batch, heads, tokens)`, from [`super::attention_keeping`].
+    pub log_sums: &'a [f32],
+    /// Gradient of the result.
+    pub grad: &'a [f32],
+    /// The sizes.
+    pub shape: Shape,
+}
+
+/// One head of one sequence.
+struct Task<'a> {
+    source: Source<'a>,
+    batch: usize,
+    head: usize,
+    scratch: &'a mut Scratch,
+    out: Output,
+}
+
+/// Rows `(token, channel)` of one head inside a wider matrix.
+#[derive(Clone, Copy)]
+struct Head<'a> {
+    values: &'a [f32],
+    first: usize,
+    stride: usize,
+    dim: usize,
+    tokens: usize,
+}
+
+impl Head<'_> {
+    #[inline(always)]
+    fn row(&self, token: usize) -> &[f32] {
+        &self.values[self.first + token * self.stride..][..self.dim]
+    }
+
+    /// Panels of `width` tokens, each channel by channel; tokens past the end are zeros.
+    #[inline(always)]
+    fn across(&self, width: usize, scale: f32, to: &mut [f32]) {
+        let panel = self.dim * width;
+        to[self.tokens / width * panel..].fill(0.0);
+        for t in 0..self.tokens {
+            let to = &mut to[t / width * panel + t % width..];
+            for (c, x) in self.row(t).iter().enumerate() {
+                to[c * width] = x * scale;
+            }
+        }
+    }
+
+    /// Panels of `width` channels, each token by token, `room` tokens to a panel.
+    #[inline(always)]
+    fn along(&self, width: usize, room: usize, to: &mut [f32]) {
+        for t in 0..self.tokens {
+            for (p, part) in self.row(t).chunks(width).enumerate() {
+                to[(p * room + t) * width..][..part.len()].copy_from_slice(part);
+            }
+        }
+    }
+}
+
+/// `sums[row] += sum_p a[p][row] b[p]` for `rows` rows and all channel panels: `a` at `p * a_step + row * a_row`, `b` and
+/// `sums` in panels along the channels of `b_room` and `sums_room` rows.
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn accumulate<S: Simd, const MR: usize>(
+    (depth, rows, panels): (usize, usize, usize),
+    a: &[f32],
+    (a_step, a_row): (usize, usize),
+    (b, b_room, b_first): (&[f32], usize, usize),
+    (sums, sums_room, sums_first): (&mut [f32], usize, usize),
+) {
+    let nr = 2 * S::W;
+    let row_panels = rows.div_ceil(MR);
+    assert!(a.len() >= BLOCK * BLOCK && depth <= BLOCK && row_panels * MR <= BLOCK);
+    for c in 0..panels {
+        let b = &b[(c * b_room + b_first) * nr..][..depth * nr];
+        let to = &mut sums[(c * sums_room + sums_first) * nr..][..row_panels * MR * nr];
+        for i in 0..row_panels {
+            // SAFETY: `a` is BLOCK x BLOCK and both indices stay under BLOCK; `b` has `depth` rows of two vectors, `to`
+            // MR of them for each `i`.
+            unsafe {
+                let to = to.as_mut_ptr().add(i * MR * nr);
+                let mut acc = [[S::zero(); 2]; MR];
+                for r in 0..MR {
+                    acc[r] = [S::load(to.add(r * nr)), S::load(to.add(r * nr + S::W))];
+                }
+                let acc = tile::<S, MR>(depth, a.as_ptr().add(i * MR * a_row), a_step, a_row, b.as_ptr(), acc);
+                for r in 0..MR {
+                    S::store(to.add(r * nr), acc[r][0]);
+                    S::store(to.add(r * nr + S::W), acc[r][1]);
+                }
+            }
+        }
+    }
+}
+
+/// `to[query][key] = a b` for one block, `a` in panels of tile rows, `b` in panels of tile columns, `depth` channels.
+#[inline(always)]
+fn products<S: Simd, const MR: usize>(
+    depth: usize,
+    (rows, a): (usize, &[f32]),
+    (cols, b): (usize, &[f32]),
+    to: &mut [f32],
+) {
+    let nr = 2 * S::W;
+    for j in 0..cols.div_ceil(nr) {
+        let b = &b[j * depth * nr..][..depth * nr];
+        for i in 0..rows.div_ceil(MR) {
+            let a = &a[i * depth * MR..][..depth * MR];
+            let to = &mut to[i * MR * BLOCK..][..MR * BLOCK];
+            // SAFETY: `a` has `depth` columns of MR, `b` `depth` rows of two vectors; `to` MR rows of BLOCK, and panel
+            // `j` is inside because BLOCK is a multiple of `nr`.
+            unsafe {
+                let acc = tile::<S, MR>(depth, a.as_ptr(), MR, 1, b.as_ptr(), [[S::zero(); 2]; MR]);
+                for r in 0..MR {
+                    let row = to.as_mut_ptr().add(r * BLOCK + j * nr);
+                    S::store(row, acc[r][0]);
+                    S::store(row.add(S::W), acc[r][1]);
+                }
+            }
+        }
+    }
+}
+
+/// Logits become weights, and gradients of weights become gradients of logits.
+#[inline(always)]
+fn turn<S: Simd>(cols: usize, log_sum: f32, correction: f32, weights: &mut [f32], grads: &mut [f32]) {
+    let (log_sum, correction) = (S::splat(log_sum), S::splat(correction));
+    for (w, g) in weights[..cols].chunks_exact_mut(S::W).zip(grads[..cols].chunks_exact_mut(S::W)) {
+        // SAFETY: both chunks have one vector.
+        unsafe {
+            let weight = exp2::<S>(S::sub(S::load(w.as_ptr()), log_sum));
+            S::store(w.as_mut_ptr(), weight);
+            S::store(g.as_mut_ptr(), S::mul(weight, S::sub(S::load(g.as_ptr()), correction)));
+        }
+    }
+}
+
+impl Kernel for Task<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<S: Simd, const MR: usize>(self) {
+        let Source { qkv, result, log_sums, grad, shape } = self.source;
+        let (n, d, width, nr) = (shape.tokens, shape.head_dim, shape.width(), 2 * S::W);
+        let room = n.next_multiple_of(BLOCK);
+        let panels = d.div_ceil(nr);
+        let scratch = self.scratch;
+        let log_sums = &log_sums[(self.batch * shape.heads + self.head) * n..][..n];
+        let part = |values, part: usize, stride: usize| Head {
+            values,
+            first: self.batch * n * stride + part * width + self.head * d,
+            stride,
+            dim: d,
+            tokens: n,
+        };
+        let (q, k, v) = (part(qkv, 0, 3 * width), part(qkv, 1, 3 * width), part(qkv, 2, 3 * width));
+        let (g, o) = (part(grad, 0, width), part(result, 0, width));
+
+        let scale = 1.0 / (d as f32).sqrt();
+        let query_rows = scratch.query_rows.at_least(room * d);
+        // The same rounding as in the forward pass, so that the weights fit the kept sums.
+        q.across(MR, std::f32::consts::LOG2_E / (d as f32).sqrt(), query_rows);
+        let grad_rows = scratch.grad_rows.at_least(room * d);
+        g.across(MR, 1.0, grad_rows);
+        let key_columns = scratch.key_columns.at_least(room * d);
+        k.across(nr, 1.0, key_columns);
+        let value_columns = scratch.value_columns.at_least(room * d);
+        v.across(nr, 1.0, value_columns);
+        let keys = scratch.keys.at_least(room * panels * nr);
+        k.along(nr, room, keys);
+        let queries = scratch.queries.at_least(room * panels * nr);
+        q.along(nr, room, queries);
+        let grads = scratch.grads.at_least(room * panels * nr);
+        g.along(nr, room, grads);
+        let corrections = scratch.corrections.at_least(n);
+        for (t, correction) in corrections.iter_mut().enumerate() {
+            *correction = g.row(t).iter().zip(o.row(t)).map(|(g, o)| g * o).sum();
+        }
+        let weights = scratch.weights.at_least(BLOCK * BLOCK);
+        let logit_grads = scratch.logit_grads.at_least(BLOCK * BLOCK);
+        let query_sums = scratch.query_sums.at_least(room * panels * nr);
+        let key_sums = scratch.key_sums.at_least(BLOCK * panels * nr);
+        let value_sums = scratch.value_sums.at_least(BLOCK * panels * nr);
+        query_sums.fill(0.0);
+
+        for first_key in (0..n).step_by(BLOCK) {
+            let key_count = BLOCK.min(n - first_key);
+            let cols = key_count.next_multiple_of(nr);
+            key_sums.fill(0.0);
+            value_sums.fill(0.0);
+            for first in (0..n).step_by(BLOCK) {
+                let count = BLOCK.min(n - first);
+                products::<S, MR>(d, (count, &query_rows[first * d..]), (cols, &key_columns[first_key * d..]), weights);
+                products::<S, MR>(
+                    d,
+                    (count, &grad_rows[first * d..]),
+                    (cols, &value_columns[first_key * d..]),
+                    logit_grads,
+                );
+                for r in 0..count {
+                    let (w, g) = (&mut weights[r * BLOCK..][..BLOCK], &mut logit_grads[r * BLOCK..][..BLOCK]);
+                    turn::<S>(cols, log_sums[first + r], corrections[first + r], w, g);
+                }
+                let over_queries = (count, key_count, panels);
+                accumulate::<S, MR>(over_queries, weights, (BLOCK, 1), (grads, room, first), (value_sums, BLOCK, 0));
+                accumulate::<S, MR>(
+                    over_queries,
+                    logit_grads,
+                    (BLOCK, 1),
+                    (queries, room, first),
+                    (key_sums, BLOCK, 0),
+                );
+                let over_keys = (key_count, count, panels);
+                accumulate::<S, MR>(
+                    over_keys,
+                    logit_grads,
+                    (1, BLOCK),
+                    (keys, room, first_key),
+                    (query_sums, room, first),
+                );
+            }
+            for t in 0..key_count {
+                let row = (self.batch * n + first_key + t) * 3 * width + self.head * d;
+                // SAFETY: batch and head identify the task: no other writes these columns of these rows.
+                let (to_key, to_value) = unsafe { (self.out.row(row + width, d), self.out.row(row + 2 * width, d)) };
+                write(to_key, nr, |p| &key_sums[(p * BLOCK + t) * nr..], scale);
+                write(to_value, nr, |p| &value_sums[(p * BLOCK + t) * nr..], 1.0);
+            }
+        }
+        for t in 0..n {
+            // SAFETY: as above.
+            let to = unsafe { self.out.row((self.batch * n + t) * 3 * width + self.head * d, d) };
+            write(to, nr, |p| &query_sums[(p * room + t) * nr..], scale);
+        }
+    }
+}
+
+#[inline(always)]
+fn write<'a>(to: &mut [f32], width: usize, panel: impl Fn(usize) -> &'a [f32], scale: f32) {
+    for (p, part) in to.chunks_mut(width).enumerate() {
+        part.iter_mut().zip(panel(p)).for_each(|(to, sum)| *to = sum * scale);
+    }
+}
+
+/// Gradient of `qkv`, in its layout.
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
+pub fn attention_backward(isa: Isa, source: Source<'_>, out: &mut [f32]) {
+    let shape = source.shape;
+    let rows = shape.batch * shape.tokens;
+    assert!(source.qkv.len() == rows * 3 * shape.width() && out.len() == source.qkv.len(), "qkv of {shape:?}");
+    assert!(source.grad.len() == rows * shape.width() && source.result.len() == source.grad.len(), "{shape:?}");
+    assert_eq!(source.log_sums.len(), rows * shape.heads, "sums of {shape:?}");
+    let output = Output { start: out.as_mut_ptr(), len: out.len() };
+    (0..shape.batch * shape.heads).into_par_iter().with_max_len(1).for_each(|index| {
+        let (batch, head) = (index / shape.heads, index % shape.heads);
+        // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
+        SCRATCH.with_borrow_mut(|scratch| dispatch(isa, Task { source, batch, head, scratch, out: output }));
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::attention_keeping;
+    use super::*;
+    use crate::kernels::tests::{noise, worst_difference};
+
+    /// Gradients of up to a few units, from sums of a few hundred products.
+    const TOLERANCE: f64 = 1e-5;
+
+    /// Obvious f64 version.
+    fn reference(qkv: &[f32], grad: &[f32], s: Shape) -> Vec<f64> {
+        let (n, d, width) = (s.tokens, s.head_dim, s.width());
+        let mut out = vec![0f64; qkv.len()];
+        let at =
+            |b: usize, t: usize, part: usize, h: usize, c: usize| (b * n + t) * 3 * width + part * width + h * d + c;
+        let value = |i: usize| f64::from(qkv[i]);
+        for b in 0..s.batch {
+            for h in 0..s.heads {
+                for t in 0..n {
+                    let logits: Vec<f64> = (0..n)
+                        .map(|u| (0..d).map(|c| value(at(b, t, 0, h, c)) * value(at(b, u, 1, h, c))).sum::<f64>())
+                        .map(|l| l / (d as f64).sqrt())
+                        .collect();
+                    let top = logits.iter().fold(f64::NEG_INFINITY, |a, &l| a.max(l));
+                    let total: f64 = logits.iter().map(|l| (l - top).exp()).sum();
+                    let weights: Vec<f64> = logits.iter().map(|l| (l - top).exp() / total).collect();
+                    let g: Vec<f64> = (0..d).map(|c| grad[(b * n + t) * width + h * d + c].into()).collect();
+                    let along: Vec<f64> =
+                        (0..n).map(|u| (0..d).map(|c| g[c] * value(at(b, u, 2, h, c))).sum()).collect();
+                    let mean: f64 = weights.iter().zip(&along).map(|(w, a)| w * a).sum();
+                    for u in 0..n {
+                        let ds = weights[u] * (along[u] - mean) / (d as f64).sqrt();
+                        for c in 0..d {
+                            out[at(b, u, 2, h, c)] += weights[u] * g[c];
+                            out[at(b, t, 0, h, c)] += ds * value(at(b, u, 1, h, c));
+                            out[at(b, u, 1, h, c)] += ds * value(at(b, t, 0, h, c));
+                        }
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    fn run(isa: Isa, qkv: &[f32], grad: &[f32], shape: Shape) -> Vec<f32> {
+        let mut result = vec![0.0; grad.len()];
+        let log_sums = attention_keeping(isa, qkv, shape, &mut result);
+        let mut out = vec![f32::NAN; qkv.len()];
+        attention_backward(isa, Source { qkv, result: &result, log_sums: &log_sums, grad, shape }, &mut out);
+        out
+    }
+
+    #[test]
+    fn every_shape() {
+        let shapes = [
+            (1, 1, 1, 1),
+            (1, 2, 3, 8),
+            (2, 20, 4, 16),
+            (1, 97, 1, 64),
+            (1, 255, 2, 24),
+            (2, 193, 2, 7),
+            (1, 300, 1, 40),
+        ];
+        for isa in Isa::tested() {
+            for (i, &(batch, tokens, heads, head_dim)) in shapes.iter().enumerate() {
+                let s = Shape { batch, tokens, heads, head_dim };
+                let mut qkv = noise(i as u64, batch * tokens * 3 * s.width(), 1.0);
+                qkv.iter_mut().step_by(7).for_each(|x| *x *= 3.0);
+                let grad = noise(i as u64 + 50, batch * tokens * s.width(), 1.0);
+                let worst = worst_difference(&run(isa, &qkv, &grad, s), &reference(&qkv, &grad, s));
+                assert!(worst < TOLERANCE, "{isa:?} {s:?}: {worst:e}");
+            }
+        }
+    }
+
+    #[test]
+    fn big_logits_stay_finite() {
+        let s = Shape { batch: 1, tokens: 150, heads: 2, head_dim: 16 };
+        let mut qkv = noise(5, s.tokens * 3 * s.width(), 1.0);
+        for row in qkv.chunks_exact_mut(3 * s.width()) {
+            row[..2 * s.width()].iter_mut().for_each(|x| *x *= 100.0);
+        }
+        let grad = noise(6, s.tokens * s.width(), 1.0);
+        for isa in Isa::tested() {
+            assert!(run(isa, &qkv, &grad, s).iter().all(|x| x.is_finite()));
+        }
+    }
+
+    #[test]
+    fn same_bits_for_any_thread_count() {
+        let s = Shape { batch: 2, tokens: 233, heads: 3, head_dim: 20 };
+        let qkv = noise(7, s.batch * s.tokens * 3 * s.width(), 2.0);
+        let grad = noise(8, s.batch * s.tokens * s.width(), 1.0);
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| run(Isa::detect(), &qkv, &grad, s)).iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+        };
+        let one = with(1);
+        for threads in [2, 3, 8] {
+            assert!(with(threads) == one, "{threads} threads");
+        }
+    }
+}
