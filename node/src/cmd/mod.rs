@@ -8,6 +8,7 @@ mod interrupt;
 mod render;
 mod replay;
 mod synth;
+mod train;
 
 use std::io::IsTerminal;
 
@@ -73,6 +74,8 @@ enum Command {
     Render(render::Args),
     /// Say what a bag holds and how it would be used.
     Info(info::Args),
+    /// Make weights: train a network on procedural drives.
+    Train(Box<train::Args>),
     /// Measure run time: the network at full size, the rasteriser, the drive, and the settings of a step.
     Bench(bench::Args),
     /// Print every configuration key with its default and meaning, as a YAML file ready to edit.
@@ -90,6 +93,7 @@ impl Cli {
             Command::Synth(a) => synth::run(&a, progress),
             Command::Render(a) => render::run(&a),
             Command::Info(a) => info::run(&a),
+            Command::Train(a) => train::run(&a, progress),
             Command::Bench(a) => bench::run(&a, progress),
             Command::Config(a) => config::run(&a),
         };
