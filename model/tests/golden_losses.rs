@@ -74,6 +74,6 @@ fn the_sky_at_a_depth() {
     let options =
         RenderLossOptions { sky_opacity: 0.0, velocity: 0.0, sky_depth_m: Some(300.0), ..RenderLossOptions::default() };
     let terms =
-        [("rgb", "rgb_loss"), ("depth", "depth_loss"), ("sky_depth", "sky_depth_loss"), ("opacity", "opacity_loss")];
+        [("rgb", "rgb_loss"), ("depth", "depth_loss"), ("sky_depth", "sky_depth_loss"), ("opaque", "opacity_loss")];
     check("skydepth_pixel", &options, &terms);
 }

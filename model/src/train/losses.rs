@@ -13,6 +13,8 @@ const DEPTH_KNOWN_M: f64 = 0.01;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RenderLossOptions {
+    /// Depth of the drawn picture (paper: 1); 0 learns without depth.
+    pub depth: f64,
     /// Opacity against the sky mask (paper: 0.1).
     pub sky_opacity: f64,
     /// Mean squared velocity component (paper: 0.005).
@@ -27,7 +29,14 @@ pub struct RenderLossOptions {
 
 impl Default for RenderLossOptions {
     fn default() -> Self {
-        Self { sky_opacity: 0.1, velocity: 0.005, structure: 0.05, structure_from_step: 5000, sky_depth_m: None }
+        Self {
+            depth: 1.0,
+            sky_opacity: 0.1,
+            velocity: 0.005,
+            structure: 0.05,
+            structure_from_step: 5000,
+            sky_depth_m: None,
+        }
     }
 }
 
@@ -66,6 +75,11 @@ impl Terms {
         self.0.push((name, value));
     }
 
+    /// Adds all terms of another set.
+    pub fn extend(&mut self, other: Self) {
+        self.0.extend(other.0);
+    }
+
     /// The terms in the order they were added.
     pub fn iter(&self) -> impl Iterator<Item = (&'static str, &Tensor)> {
         self.0.iter().map(|(name, x)| (*name, x))
@@ -99,9 +113,10 @@ pub fn render_losses(
     let image = channel_last(&target.image)?;
     terms.push("rgb", color_loss(&rendered.image, &image)?);
     if let Some(depth) = &target.depth
+        && options.depth > 0.0
         && let Some(loss) = depth_loss(&rendered.depth, depth)?
     {
-        terms.push("depth", loss);
+        terms.push("depth", (loss * options.depth)?);
     }
     if options.structure > 0.0 && step >= options.structure_from_step {
         terms.push("structure", (structure_loss(&rendered.image, &image)? * options.structure)?);
@@ -119,7 +134,7 @@ pub fn render_losses(
                 terms.push("sky_depth", (loss * SKY_DEPTH_WEIGHT)?);
             }
             let opacity = rendered.alpha.affine(1.0, -1.0)?.sqr()?.mean_all()?;
-            terms.push("opacity", (opacity * SKY_DEPTH_WEIGHT)?);
+            terms.push("opaque", (opacity * SKY_DEPTH_WEIGHT)?);
         }
     }
     Ok(terms)

@@ -11,10 +11,15 @@ pub mod losses;
 mod options;
 mod perceptual;
 mod pixel;
+mod raster;
+mod render_stage;
+#[cfg(test)]
+mod render_tests;
 mod schedule;
 mod trainer;
 mod truth;
 mod validate;
+mod views;
 
 pub use adamw::AdamOptions;
 pub use checkpoint::provenance;
@@ -24,6 +29,8 @@ pub use loader::{DataOptions, Loader};
 pub use options::{Stage, TrainOptions};
 pub use perceptual::structure_loss;
 pub use pixel::{PixelLossOptions, pixel_losses};
+pub use raster::{SceneGradient, SharedRenderer};
+pub use render_stage::{draw_targets, render_stage_losses};
 pub use schedule::Schedule;
 pub use trainer::{StepReport, Trainer};
 pub use truth::{SkySamples, Truth};

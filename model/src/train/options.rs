@@ -15,6 +15,10 @@ use super::schedule::Schedule;
 pub enum Stage {
     /// Every Gaussian against the truth of its own pixel; draws nothing.
     Pixel,
+    /// The paper's: pictures drawn at other times against what the cameras saw.
+    Render,
+    /// Both sums together.
+    Both,
 }
 
 /// A training run. With the same options, configuration and first weights, two runs give the same bytes.
@@ -71,6 +75,9 @@ impl TrainOptions {
         };
         let unit = 0.0..1.0;
         rule((1..=4096).contains(&self.batch), "batch", self.batch as f64, "1 to 4096")?;
+        if self.stage != Stage::Pixel {
+            rule((1..=10).contains(&self.clips.targets), "targets", self.clips.targets as f64, "1 to 10")?;
+        }
         let peak = self.schedule.peak;
         rule(peak > 0.0 && peak <= 1.0, "lr", peak, "more than 0, at most 1")?;
         rule(self.schedule.steps > 0, "steps", 0.0, "at least 1")?;
@@ -89,6 +96,10 @@ impl TrainOptions {
             ("sky_color", p.sky_color),
             ("velocity", p.velocity),
             ("flow", p.flow),
+            ("render depth", self.render.depth),
+            ("sky_opacity", self.render.sky_opacity),
+            ("render velocity", self.render.velocity),
+            ("structure", self.render.structure),
             ("weight_decay", a.weight_decay),
             ("clip_norm", a.clip_norm),
         ];
@@ -101,10 +112,17 @@ impl TrainOptions {
 
     /// One line on what weights trained so have seen, for their metadata.
     pub fn describe(&self) -> String {
-        let labels = match self.stage {
-            Stage::Pixel if self.pixel.flow > 0.0 => "pixel stage: depth, sky, colour and ground-truth flow labels",
-            Stage::Pixel => "pixel stage: depth, sky and colour labels, no flow labels",
-        };
+        let mut labels = Vec::new();
+        if self.stage != Stage::Render {
+            let flow = if self.pixel.flow > 0.0 { "with ground-truth flow labels" } else { "no flow labels" };
+            let depth = if self.pixel.log_depth + self.pixel.depth > 0.0 { "depth, " } else { "" };
+            labels.push(format!("pixel stage ({depth}sky and colour labels, {flow})"));
+        }
+        if self.stage != Stage::Pixel {
+            let depth = if self.render.depth > 0.0 { "depth and sky labels" } else { "sky labels" };
+            labels.push(format!("render stage ({depth}, no flow labels)"));
+        }
+        let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
             "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera); batch {}, peak rate {:e}, schedule of {} steps",

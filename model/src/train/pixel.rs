@@ -73,7 +73,7 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
         add("log_depth", options.log_depth, masked_mean(&error, &surface)?)?;
     }
     if options.depth > 0.0 {
-        add("depth", options.depth, depth_loss(&output.depths, &truth.distance)?)?;
+        add("pixel_depth", options.depth, depth_loss(&output.depths, &truth.distance)?)?;
     }
     if options.color > 0.0 {
         let exposed = exposed(output, &output.colors)?;
@@ -121,7 +121,7 @@ pub(super) fn velocities(output: &ClipOutput) -> Vec<&Tensor> {
 }
 
 /// Colours `(b, t, v, h, w, 3)` after their camera's exposure.
-fn exposed(output: &ClipOutput, colors: &Tensor) -> Result<Tensor, ModelError> {
+pub(super) fn exposed(output: &ClipOutput, colors: &Tensor) -> Result<Tensor, ModelError> {
     let &[b, t, v, h, w, _] = colors.dims() else {
         return Err(ModelError::Input(format!("colours have shape {:?}", colors.dims())));
     };

@@ -1,10 +1,11 @@
 //! One training step after another: forward, losses, backward, AdamW, with nothing non-finite let through.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use candle_core::{Device, Tensor, Var};
+use storm_render::raster::CpuRasterizer;
 
 use super::adamw::{self, Slot};
 use super::clips::TrainClip;
@@ -12,7 +13,9 @@ use super::error::TrainError;
 use super::loader::DataOptions;
 use super::losses::Terms;
 use super::options::{Stage, TrainOptions};
-use super::pixel::pixel_losses;
+use super::pixel::{PixelLossOptions, pixel_losses};
+use super::raster::SharedRenderer;
+use super::render_stage::render_stage_losses;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
 use crate::network::Storm;
@@ -47,6 +50,7 @@ pub struct Trainer {
     vars: Vec<Var>,
     frozen: Tensors,
     model: Storm,
+    renderer: SharedRenderer,
     step: u64,
 }
 
@@ -84,7 +88,14 @@ impl Trainer {
         tensors.extend(slots.iter().zip(&vars).map(|(s, v)| (s.name.clone(), v.as_tensor().clone())));
         let model = Storm::new(config, &tensors)?;
         let config = Arc::new(model.config().clone());
-        Ok(Self { config, options, device: device.clone(), slots, vars, frozen, model, step })
+        let raster = CpuRasterizer::new(config.raster_settings()).map_err(|e| ModelError::Render(e.to_string()))?;
+        let renderer: SharedRenderer = Arc::new(Mutex::new(raster));
+        Ok(Self { config, options, device: device.clone(), slots, vars, frozen, model, renderer, step })
+    }
+
+    /// Draws with another renderer from now on.
+    pub fn set_renderer(&mut self, renderer: SharedRenderer) {
+        self.renderer = renderer;
     }
 
     /// The network's configuration.
@@ -196,6 +207,15 @@ impl Trainer {
     fn losses(&self, output: &crate::ClipOutput, clip: &TrainClip) -> Result<Terms, ModelError> {
         match self.options.stage {
             Stage::Pixel => pixel_losses(output, clip, &self.options.pixel),
+            Stage::Render => render_stage_losses(output, clip, &self.renderer, &self.options.render, self.step),
+            Stage::Both => {
+                // The velocity regulariser is in the paper's losses already.
+                let pixel = PixelLossOptions { velocity: 0.0, ..self.options.pixel };
+                let mut terms = pixel_losses(output, clip, &pixel)?;
+                let render = &self.options.render;
+                terms.extend(render_stage_losses(output, clip, &self.renderer, render, self.step)?);
+                Ok(terms)
+            }
         }
     }
 

@@ -1,14 +1,13 @@
 //! Error figures of a network on drives it was never trained on, cheap enough to ask for during training.
 
 use candle_core::{Device, Tensor};
-use glam::{Affine3A, Mat3A, Vec3A};
 use serde::Serialize;
+use storm_render::View;
 use storm_render::raster::CpuRasterizer;
-use storm_render::{Intrinsics, View};
 
 use super::clips::{ClipOptions, ClipPlan, TrainClip};
 use super::error::TrainError;
-use crate::clip::ClipBatch;
+use super::views::views;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
 use crate::metrics::flow::flow_scores;
@@ -146,17 +145,4 @@ fn score(
         }
     }
     Ok(())
-}
-
-/// The views of a clip of one window, timestep by timestep.
-fn views(clip: &ClipBatch) -> Result<Vec<View>, TrainError> {
-    let [_, _, _, height, width] = clip.dims()?;
-    let (ks, poses) = (numbers(&clip.intrinsics)?, numbers(&clip.world_from_camera)?);
-    let view = |(k, m): (&[f32], &[f32])| {
-        let column = |c: usize| Vec3A::new(m[c], m[4 + c], m[8 + c]);
-        let rotation = Mat3A::from_cols(column(0), column(1), column(2));
-        let pose = Affine3A { matrix3: rotation, translation: column(3) };
-        View::from_pose(pose, Intrinsics { fx: k[0], fy: k[4], cx: k[2], cy: k[5], width, height })
-    };
-    Ok(ks.chunks_exact(9).zip(poses.chunks_exact(16)).map(view).collect())
 }

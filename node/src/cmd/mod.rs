@@ -9,6 +9,7 @@ mod interrupt;
 mod render;
 mod replay;
 mod synth;
+mod train;
 
 use std::io::IsTerminal;
 
@@ -76,6 +77,8 @@ enum Command {
     Info(info::Args),
     /// Error figures on procedural drives that training never sees, beside simple baselines.
     Eval(eval::Args),
+    /// Make weights: train a network on procedural drives.
+    Train(Box<train::Args>),
     /// Measure run time: the network at full size, the rasteriser, the drive, and the settings of a step.
     Bench(bench::Args),
     /// Print every configuration key with its default and meaning, as a YAML file ready to edit.
@@ -94,6 +97,7 @@ impl Cli {
             Command::Render(a) => render::run(&a),
             Command::Info(a) => info::run(&a),
             Command::Eval(a) => eval::run(&a, progress),
+            Command::Train(a) => train::run(&a, progress),
             Command::Bench(a) => bench::run(&a, progress),
             Command::Config(a) => config::run(&a),
         };

@@ -1,0 +1,106 @@
+//! The paper's stage: Gaussians moved to the target times, drawn, put before the sky, exposed, and compared.
+
+use candle_core::{D, Tensor};
+use storm_render::View;
+
+use super::clips::TrainClip;
+use super::losses::{RenderLossOptions, Rendered, Target, Terms, render_losses};
+use super::pixel::velocities;
+use super::raster::{DRAWN, SharedRenderer, draw};
+use super::truth::Truth;
+use super::views::views;
+use crate::clip::ClipBatch;
+use crate::config::{DepthMeaning, ModelConfig, VelocityKind};
+use crate::error::ModelError;
+use crate::network::ClipOutput;
+use crate::rays::Rays;
+
+/// All terms of a batch whose clips have target pictures.
+pub fn render_stage_losses(
+    output: &ClipOutput,
+    clip: &TrainClip,
+    renderer: &SharedRenderer,
+    options: &RenderLossOptions,
+    step: u64,
+) -> Result<Terms, ModelError> {
+    let Some((target, truth)) = &clip.target else {
+        return Err(ModelError::Input("the clips have no target pictures".into()));
+    };
+    let Truth { depth, sky, .. } = truth;
+    let rendered = draw_targets(output, target, renderer)?;
+    let depth = (options.depth > 0.0).then(|| depth.clone());
+    let target = Target { image: target.image.clone(), depth, sky: Some(sky.clone()) };
+    render_losses(&rendered, &target, &velocities(output), options, step)
+}
+
+/// What the network's windows look like from the target views, as [`crate::Scene::render`] draws them.
+pub fn draw_targets(
+    output: &ClipOutput,
+    target: &ClipBatch,
+    renderer: &SharedRenderer,
+) -> Result<Rendered, ModelError> {
+    let [b, t, v, h, w] = target.dims()?;
+    let &[batch, steps, cameras, rows, cols] = output.opacities.dims() else {
+        return Err(ModelError::Input("opacities are not (b, t, v, h, w)".into()));
+    };
+    if batch != b || cameras != v {
+        let text = format!("targets of {b} windows and {v} cameras for {batch} windows and {cameras} cameras");
+        return Err(ModelError::Input(text));
+    }
+    let n = steps * cameras * rows * cols;
+    let still = Tensor::cat(
+        &[&output.quats, &output.scales, &output.opacities.unsqueeze(D::Minus1)?, &output.colors],
+        D::Minus1,
+    )?;
+    let times = target.time_sec.to_device(&candle_core::Device::Cpu)?.flatten_all()?.to_vec1::<f32>()?;
+    let views = views(target)?;
+    let mut drawn = Vec::with_capacity(b * t);
+    for window in 0..b {
+        let still = still.get(window)?.reshape((n, ()))?;
+        for k in 0..t {
+            let first = (window * t + k) * v;
+            let means = means_at(output, window, f64::from(times[first]))?.reshape((n, 3))?;
+            let seen: Vec<View> = views[first..first + v].to_vec();
+            drawn.push(draw(&Tensor::cat(&[&means, &still], 1)?, seen, renderer)?);
+        }
+    }
+    let drawn = Tensor::stack(&drawn, 0)?.reshape(vec![b, t, v, h, w, DRAWN])?;
+    let channel = |at: usize| drawn.narrow(D::Minus1, at, 1)?.squeeze(D::Minus1);
+    let alpha = channel(3)?.contiguous()?;
+    let colors = drawn.narrow(D::Minus1, 0, 3)?.contiguous()?;
+    let image = finish(output, colors, &alpha, target)?;
+    Ok(Rendered { image, depth: channel(4)?.contiguous()?, alpha })
+}
+
+/// Centres of one window at a time (paper eq. 1), `(t, v, h, w, 3)`.
+fn means_at(output: &ClipOutput, window: usize, time_sec: f64) -> Result<Tensor, ModelError> {
+    let means = output.means.get(window)?;
+    let ahead = output.time_sec.get(window)?.affine(-1.0, time_sec)?;
+    let (t, v) = ahead.dims2()?;
+    let moved =
+        |velocity: &Tensor, ahead: &Tensor| velocity.get(window)?.broadcast_mul(&ahead.reshape(vec![t, v, 1, 1, 1])?);
+    Ok(match output.config.velocity {
+        VelocityKind::One => (means + moved(&output.velocity_forward, &ahead)?)?,
+        VelocityKind::ForwardBackward => {
+            let later = moved(&output.velocity_forward, &ahead.maximum(0.0)?)?;
+            let earlier = moved(&output.velocity_backward, &ahead.minimum(0.0)?)?;
+            ((means + later)? + earlier)?
+        }
+    })
+}
+
+/// Sky behind, then exposure. `colors` is `(b, t, v, h, w, 3)`.
+fn finish(output: &ClipOutput, colors: Tensor, alpha: &Tensor, target: &ClipBatch) -> Result<Tensor, ModelError> {
+    let [b, t, v, h, w] = target.dims()?;
+    let mut colors = colors;
+    if output.sky_token.is_some() {
+        // The sky head takes directions with z = 1 in their camera, whatever depth means.
+        let config = ModelConfig { depth_meaning: DepthMeaning::ZDepth, ..ModelConfig::clone(&output.config) };
+        let directions = Rays::new(&config, target)?.directions.reshape((b, t * v * h * w, 3))?;
+        if let Some(sky) = output.sky_color(&directions)? {
+            let gap = alpha.affine(-1.0, 1.0)?.unsqueeze(D::Minus1)?;
+            colors = (colors + sky.reshape(vec![b, t, v, h, w, 3])?.broadcast_mul(&gap)?)?;
+        }
+    }
+    super::pixel::exposed(output, &colors)
+}

@@ -1,0 +1,267 @@
+//! `storm train`: makes weights from procedural drives.
+
+mod curves;
+
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use candle_core::Device;
+use storm_model::train::{ClipOptions, Loader, Stage, TrainError, TrainOptions, Trainer, provenance, validate};
+use storm_model::weights::{self, SavedType, save_safetensors, untrained};
+use storm_model::{ModelConfig, Storm};
+use tracing::info;
+
+use super::{Outcome, UsageError, interrupt, progress_bar};
+use curves::Curves;
+
+/// Target times drawn for validation.
+const VALIDATION_TARGETS: usize = 2;
+
+/// Arguments of `storm train`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Architecture of a new network.
+    #[arg(long, default_value = "tiny", conflicts_with_all = ["weights", "resume"])]
+    preset: String,
+    /// Start from these weights, with a fresh optimiser.
+    #[arg(long, conflicts_with = "resume")]
+    weights: Option<PathBuf>,
+    /// Go on exactly where this checkpoint was written; its options hold, only --out, --minutes and the reports differ.
+    #[arg(long)]
+    resume: Option<PathBuf>,
+    /// Chooses the first weights and all training data; drives 10,000 to 19,999 are never used.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Steps of the whole run (the learning rate falls to its end over them).
+    #[arg(long, default_value_t = 10_000)]
+    steps: u64,
+    /// Clips per step.
+    #[arg(long, default_value_t = 8)]
+    batch: usize,
+    /// Highest learning rate [default: 4e-4, the paper's].
+    #[arg(long, default_value_t = 4e-4)]
+    lr: f64,
+    /// What to learn from. pixel: the truth of every context pixel (cheap); render: pictures drawn at other times, the
+    /// paper's; both: their sum.
+    #[arg(long, default_value = "pixel")]
+    stage: String,
+    /// Train without ground-truth depth (with --stage render: from pictures and sky masks alone).
+    #[arg(long)]
+    no_depth_labels: bool,
+    /// Steps before the structure term of the render stage is switched on [default: 5000, the paper's].
+    #[arg(long)]
+    structure_from: Option<u64>,
+    /// Target times drawn per clip in the render stage, 1 to 10.
+    #[arg(long, default_value_t = 4)]
+    targets: usize,
+    /// Train without ground-truth flow.
+    #[arg(long)]
+    no_flow_labels: bool,
+    /// Weight of the ground-truth flow term [default: 0.1].
+    #[arg(long, allow_hyphen_values = true)]
+    flow_weight: Option<f64>,
+    /// How much more a moving pixel weighs in the flow term [default: 10].
+    #[arg(long, allow_hyphen_values = true)]
+    moving_weight: Option<f64>,
+    /// Weight of the velocity regulariser [default: 0.005, the paper's].
+    #[arg(long, allow_hyphen_values = true)]
+    lambda_reg: Option<f64>,
+    /// Cameras of a clip, 1 to 6.
+    #[arg(long, default_value_t = 3)]
+    cameras: usize,
+    /// Steps with one camera before all are used.
+    #[arg(long, default_value_t = 0)]
+    one_camera_steps: u64,
+    /// Stop (and save) after so many minutes.
+    #[arg(long)]
+    minutes: Option<f64>,
+    /// Folder for weights, checkpoint and curves.
+    #[arg(long, default_value = "storm_out/train")]
+    out: PathBuf,
+    /// Validate every so many steps; 0 only at the end.
+    #[arg(long, default_value_t = 1000)]
+    validate_every: u64,
+    /// Held-out drives to validate on; 0 never.
+    #[arg(long, default_value_t = 8)]
+    validate_drives: u64,
+    /// Checkpoint every so many minutes.
+    #[arg(long, default_value_t = 10.0)]
+    checkpoint_minutes: f64,
+    /// Threads that make clips [default: the cores, at most 4].
+    #[arg(long, default_value_t = 0)]
+    loader_threads: usize,
+    /// Save weights as f16 (half the size).
+    #[arg(long)]
+    f16: bool,
+    /// Where to compute: cpu, cuda or metal (as built).
+    #[arg(long, default_value = "cpu")]
+    device: String,
+}
+
+/// Trains.
+pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
+    // SAFETY: the command line has been read and the log started; no other thread runs yet.
+    unsafe { storm_model::ops::set_up_training() };
+    let device = device(&args.device)?;
+    let mut trainer = start(args, &device)?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make folder {}", args.out.display()))?;
+    let total = trainer.options().schedule.steps;
+    info!(
+        "{}: {} weights, step {} of {total}; {}",
+        trainer.config().describe(),
+        trainer.weight_count(),
+        trainer.steps_done(),
+        trainer.options().describe()
+    );
+    let mut curves = Curves::open(&args.out, trainer.steps_done())?;
+    let mut loader = Loader::new(trainer.data(), trainer.config().clone(), trainer.steps_done(), args.loader_threads);
+    let stop = interrupt::stop_flag();
+    let begin = Instant::now();
+    let mut saved = Instant::now();
+    let limit = args.minutes.map(|m| Duration::try_from_secs_f64(60.0 * m)).transpose();
+    let limit = limit.map_err(|e| UsageError(format!("--minutes: {e}")))?;
+    let every = Duration::try_from_secs_f64(60.0 * args.checkpoint_minutes)
+        .map_err(|e| UsageError(format!("--checkpoint-minutes: {e}")))?;
+    let first = trainer.steps_done();
+    let bar = progress_bar(progress, total, "training").with_position(first);
+    bar.reset_eta();
+    let mut waited = 0.0;
+    while trainer.steps_done() < total
+        && !stop.load(Ordering::Relaxed)
+        && limit.is_none_or(|limit| begin.elapsed() < limit)
+    {
+        let wait = Instant::now();
+        let clip = loader.next_batch()?;
+        let wait = wait.elapsed().as_secs_f64();
+        waited += wait;
+        let report = match trainer.step(&clip) {
+            Ok(report) => report,
+            Err(e) => {
+                // The weights are still those of the step before: keep them for a look at what went wrong.
+                if matches!(e, TrainError::NonFinite { .. }) {
+                    trainer.save_checkpoint(&args.out.join("stopped.ckpt"))?;
+                }
+                return Err(e.into());
+            }
+        };
+        curves.step(&report, wait)?;
+        let done = trainer.steps_done();
+        let rate = (done - first) as f64 * trainer.options().batch as f64 / begin.elapsed().as_secs_f64();
+        bar.set_message(format!("loss {:.4}, {rate:.1} samples/s,", report.total));
+        bar.set_position(done);
+        if args.validate_every > 0 && done.is_multiple_of(args.validate_every) && done < total {
+            check(args, &trainer, &device, &mut curves)?;
+        }
+        if saved.elapsed() >= every {
+            save(args, &trainer)?;
+            saved = Instant::now();
+        }
+    }
+    bar.finish_and_clear();
+    let done = trainer.steps_done();
+    let seconds = begin.elapsed().as_secs_f64();
+    save(args, &trainer)?;
+    check(args, &trainer, &device, &mut curves)?;
+    let samples = (done - first) as f64 * trainer.options().batch as f64;
+    println!(
+        "{} steps, {seconds:.0} s, {:.2} samples/s, {:.0} % of the time waiting for clips",
+        done - first,
+        samples / seconds.max(1e-9),
+        100.0 * waited / seconds.max(1e-9)
+    );
+    println!("{}", args.out.join("weights.safetensors").display());
+    Ok(Outcome::Done)
+}
+
+/// From a checkpoint, from weights, or from nothing.
+fn start(args: &Args, device: &Device) -> Result<Trainer> {
+    if let Some(path) = &args.resume {
+        return Ok(Trainer::resume(path, device)?);
+    }
+    let (config, tensors, history) = match &args.weights {
+        Some(path) => {
+            let (config, tensors) = weights::load(path, None, &Device::Cpu)
+                .with_context(|| format!("cannot use weights {}", path.display()))?;
+            let history = provenance(path).unwrap_or_else(|| "weights of unknown origin".into());
+            (config, tensors, history)
+        }
+        None => {
+            let config = ModelConfig::preset(&args.preset).map_err(|e| UsageError(e.to_string()))?;
+            let config = ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config };
+            let tensors = untrained(&config, args.seed, &Device::Cpu)?;
+            (config, tensors, format!("untrained {}, seed {}", args.preset, args.seed))
+        }
+    };
+    let mut options = TrainOptions::new(args.seed, args.steps, args.batch, args.lr);
+    options.history = history;
+    options.stage = match args.stage.as_str() {
+        "pixel" => Stage::Pixel,
+        "render" => Stage::Render,
+        "both" => Stage::Both,
+        other => return Err(UsageError(format!("--stage {other}: use pixel, render or both")).into()),
+    };
+    options.clips = ClipOptions {
+        cameras: args.cameras,
+        width: config.image_width,
+        height: config.image_height,
+        targets: args.targets,
+        ..ClipOptions::default()
+    };
+    options.one_camera_steps = args.one_camera_steps;
+    if let Some(x) = args.flow_weight {
+        options.pixel.flow = x;
+    }
+    if args.no_flow_labels {
+        options.pixel.flow = 0.0;
+    }
+    if args.no_depth_labels {
+        (options.pixel.depth, options.pixel.log_depth, options.pixel.scale, options.render.depth) =
+            (0.0, 0.0, 0.0, 0.0);
+    }
+    if let Some(step) = args.structure_from {
+        options.render.structure_from_step = step;
+    }
+    if let Some(x) = args.moving_weight {
+        options.pixel.moving_weight = x;
+    }
+    if let Some(x) = args.lambda_reg {
+        options.pixel.velocity = x;
+        options.render.velocity = x;
+    }
+    options.check().map_err(|e| UsageError(e.to_string()))?;
+    Ok(Trainer::new(&config, &tensors, options, device)?)
+}
+
+/// Weights (their moving average), the checkpoint, and what happened before it.
+fn save(args: &Args, trainer: &Trainer) -> Result<()> {
+    trainer.save_checkpoint(&args.out.join("last.ckpt"))?;
+    let dtype = if args.f16 { SavedType::F16 } else { SavedType::F32 };
+    let provenance = format!("{}, {} steps done", trainer.options().describe(), trainer.steps_done());
+    let path = args.out.join("weights.safetensors");
+    save_safetensors(&path, trainer.config(), &trainer.weights(true)?, dtype, &provenance)?;
+    Ok(())
+}
+
+fn check(args: &Args, trainer: &Trainer, device: &Device, curves: &mut Curves) -> Result<()> {
+    if args.validate_drives == 0 {
+        return Ok(());
+    }
+    let options = ClipOptions { targets: VALIDATION_TARGETS, ..trainer.options().clips };
+    let model = Storm::new(trainer.config(), &trainer.weights(true)?)?;
+    let v = validate(&model, &options, args.validate_drives, device)?;
+    info!("step {}: {}", trainer.steps_done(), curves::describe(&v));
+    curves.validation(trainer.steps_done(), &v)?;
+    Ok(())
+}
+
+fn device(name: &str) -> Result<Device> {
+    let wrong = |e: candle_core::Error| UsageError(format!("--device {name}: {e}"));
+    Ok(match name {
+        "cpu" => Device::Cpu,
+        "cuda" => Device::new_cuda(0).map_err(wrong)?,
+        "metal" => Device::new_metal(0).map_err(wrong)?,
+        other => return Err(UsageError(format!("--device {other}: use cpu, cuda or metal")).into()),
+    })
+}
