@@ -191,12 +191,15 @@ const RIGHT: f64 = 130.0;
 const TOP: f64 = 30.0;
 const BOTTOM: f64 = 30.0;
 
+/// Smaller values are drawn as this where the axis is logarithmic.
+const LOG_FLOOR: f64 = 1e-5;
+
 /// Ten colours that stay apart for colour-blind readers too; further lines repeat them dashed.
 const COLORS: [&str; 10] =
     ["#1f77b4", "#d95f02", "#1b9e77", "#7570b3", "#e7298a", "#66a61e", "#a6761d", "#444444", "#17becf", "#b22222"];
 
 fn panel(index: usize, title: &str, lines: &[(&str, Vec<(f64, f64)>)], log: bool) -> String {
-    let scaled = |y: f64| if log { y.max(1e-9).log10() } else { y };
+    let scaled = |y: f64| if log { y.max(LOG_FLOOR).log10() } else { y };
     let all = || lines.iter().flat_map(|(_, points)| points.iter());
     let range = |values: &mut dyn Iterator<Item = f64>| {
         let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(x), h.max(x)));
@@ -219,10 +222,10 @@ fn panel(index: usize, title: &str, lines: &[(&str, Vec<(f64, f64)>)], log: bool
     );
     for k in 0..5 {
         let y = y0 + (y1 - y0) * f64::from(k) / 4.0;
-        let label = if log { 10f64.powf(y) } else { y };
+        let label = if log { format!("{:.1e}", 10f64.powf(y)) } else { format!("{y:.3}") };
         let at = py(y);
         svg += &format!(
-            "<line x1=\"{LEFT}\" x2=\"{}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"#ddd\"/><text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{label:.3}</text>\n",
+            "<line x1=\"{LEFT}\" x2=\"{}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"#ddd\"/><text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{label}</text>\n",
             LEFT + w,
             LEFT - 6.0,
             at + 4.0
