@@ -283,3 +283,14 @@ fn find_bags(dir: &Path, bags: &mut Vec<PathBuf>) {
         }
     }
 }
+
+#[test]
+fn what_came_in_is_what_was_used_and_what_was_dropped() {
+    // An unreadable image, and a camera that stops half-way.
+    let bytes = |i: usize, b: Vec<u8>| if i == 3 { vec![0, 1, 0, 0, 9] } else { b };
+    let r = run(Maker { bytes: Box::new(bytes), image: Box::new(|i, _| i < 1012), ..Maker::default() });
+    let m = metrics(&r.out);
+    let dropped: u64 = m["dropped"].as_object().unwrap().values().filter_map(|n| n.as_u64()).sum();
+    assert_eq!(r.metric("images_in"), 2 * r.metric("frames_in") + dropped, "{m}");
+    assert_eq!(r.metric("messages_lost"), 0);
+}

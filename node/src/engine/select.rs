@@ -19,14 +19,9 @@ pub fn speed_mps(scene: &Scene, i: usize) -> f32 {
     forward.max(Vec3::from(scene.gaussians.velocity_backward[i]).length())
 }
 
-/// Gaussians per timestep of the window.
-fn per_step(scene: &Scene) -> usize {
-    scene.shape.cameras * scene.shape.height * scene.shape.width
-}
-
 /// Indices of the Gaussians seen at timesteps `first..`.
 pub fn from_step(scene: &Scene, first: usize) -> std::ops::Range<usize> {
-    per_step(scene) * first..scene.gaussians.len()
+    scene.shape.picture(first, 0).start..scene.gaussians.len()
 }
 
 /// The newest timestep's moving Gaussians in map coordinates.

@@ -246,6 +246,17 @@ pub fn flow_cloud(header: Header, input: &FlowCloud) -> Result<BuiltCloud, Outpu
     Ok(built)
 }
 
+/// Values in the float columns of a cloud that are not finite: 0 for every cloud built here, counted over what is sent.
+pub fn non_finite_values(cloud: &PointCloud2) -> usize {
+    let offsets: Vec<usize> =
+        cloud.fields.iter().filter(|f| f.datatype == FLOAT32).map(|f| f.offset as usize).collect();
+    let value = |point: &[u8], at: usize| {
+        point.get(at..at + 4).and_then(|b| b.try_into().ok()).map_or(f32::NAN, f32::from_le_bytes)
+    };
+    let points = cloud.data.chunks_exact((cloud.point_step as usize).max(1));
+    points.map(|point| offsets.iter().filter(|&&at| !value(point, at).is_finite()).count()).sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -278,6 +289,11 @@ mod tests {
         };
         let built = gaussian_cloud(header(), &input).unwrap();
         let cloud = &built.cloud;
+        assert_eq!(non_finite_values(cloud), 0);
+        let mut spoiled = cloud.clone();
+        let y = cloud.point_step as usize + 4;
+        spoiled.data[y..y + 4].copy_from_slice(&f32::INFINITY.to_le_bytes());
+        assert_eq!(non_finite_values(&spoiled), 1, "the count sees what the builders would let through");
         assert_eq!((cloud.width, cloud.height, cloud.point_step, built.non_finite), (2, 1, 68, 1));
         assert_eq!(cloud.data.len(), 2 * 68);
         assert_eq!(float(cloud, 0, "rgb").to_bits(), 0x00FF_8000);

@@ -51,7 +51,7 @@ pub struct Front {
     posed: PoseStage<Frame>,
     window: WindowBuilder<Frame>,
     lost: DropCounts,
-    images_lost: u64,
+    messages_lost: u64,
     now_ns: i64,
     starved: bool,
     names: Vec<String>,
@@ -65,7 +65,7 @@ impl Front {
             posed: PoseStage::new(store, rig, &config.sync),
             window: WindowBuilder::new(&config.window, rig.reference),
             lost: DropCounts::default(),
-            images_lost: 0,
+            messages_lost: 0,
             now_ns: i64::MIN,
             starved: false,
             names: rig.cameras.iter().map(|c| c.topic.clone()).collect(),
@@ -93,8 +93,11 @@ impl Front {
                 return;
             }
             Event::Lost { camera, reason, .. } => {
-                self.lost.add(reason, 1);
-                self.images_lost += u64::from(camera.is_some());
+                // Only images are counted by reason: what came in is then what was used plus what was dropped.
+                match camera {
+                    Some(_) => self.lost.add(reason, 1),
+                    None => self.messages_lost += 1,
+                }
             }
         }
         self.sync.advance(self.now_ns);
@@ -135,7 +138,7 @@ impl Front {
 
     /// Images that arrived, readable or not.
     pub fn images_in(&self) -> u64 {
-        self.sync.images_in() + self.images_lost
+        self.sync.images_in() + self.lost.total()
     }
 
     /// Everything dropped so far, by reason, over all stages.
@@ -144,6 +147,11 @@ impl Front {
         all.merge(self.posed.drops());
         all.merge(&self.lost);
         all
+    }
+
+    /// Poses, transforms and ground truth that could not be read.
+    pub fn messages_lost(&self) -> u64 {
+        self.messages_lost
     }
 
     /// Poses refused.

@@ -18,6 +18,8 @@ pub struct Counts {
     pub images_in: u64,
     /// Images dropped, by reason.
     pub dropped: BTreeMap<String, u64>,
+    /// Poses, transforms and ground truth that could not be read.
+    pub messages_lost: u64,
     /// Poses refused.
     pub poses_rejected: u64,
     /// Windows whose result was not finite.
@@ -34,6 +36,7 @@ impl Counts {
         Self {
             images_in: front.images_in(),
             dropped,
+            messages_lost: front.messages_lost(),
             poses_rejected: front.poses_rejected(),
             non_finite_windows: finished.non_finite_windows,
             problems,
@@ -54,15 +57,18 @@ pub struct Metrics {
     pub frames_in: u64,
     /// Steps run.
     pub steps: u64,
-    /// Steps skipped because the scene did not need them.
+    /// Steps skipped because the scene did not need them. Nothing is skipped yet.
     pub steps_skipped: u64,
     /// Images dropped, by reason; every reason is listed.
     pub dropped: BTreeMap<String, u64>,
+    /// Poses, transforms and ground truth that could not be read.
+    pub messages_lost: u64,
     /// Poses refused (not finite, not a rotation).
     pub poses_rejected: u64,
     /// Windows dropped because the network's result was not finite.
     pub non_finite_windows: u64,
-    /// Non-finite values published: always 0.
+    /// Non-finite values in the published clouds and depth pictures, counted as they are written (the file writers refuse
+    /// them). Never anything but 0.
     pub nonfinite: u64,
     /// Points withheld from the published clouds because a number in them was not finite.
     pub withheld: u64,
@@ -99,7 +105,14 @@ impl Metrics {
     /// True when something of the input was lost.
     pub fn lost(&self) -> bool {
         let dropped: u64 = self.dropped.values().sum();
-        dropped + self.poses_rejected + self.non_finite_windows + self.withheld + self.map_evicted > 0
+        dropped
+            + self.messages_lost
+            + self.nonfinite
+            + self.poses_rejected
+            + self.non_finite_windows
+            + self.withheld
+            + self.map_evicted
+            > 0
             || !self.problems.is_empty()
     }
 
@@ -108,6 +121,8 @@ impl Metrics {
         let mut parts: Vec<String> =
             self.dropped.iter().filter(|(_, n)| **n > 0).map(|(r, n)| format!("{n} images {r}")).collect();
         for (n, what) in [
+            (self.messages_lost, "messages unreadable"),
+            (self.nonfinite, "non-finite values published"),
             (self.poses_rejected, "poses refused"),
             (self.non_finite_windows, "windows not finite"),
             (self.withheld, "points withheld"),

@@ -119,9 +119,4 @@ impl<T> PoseStage<T> {
     pub fn drops(&self) -> &DropCounts {
         self.gate.drops()
     }
-
-    /// Images still waiting for poses.
-    pub fn pending(&self) -> usize {
-        self.gate.pending()
-    }
 }

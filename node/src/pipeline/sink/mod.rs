@@ -3,7 +3,7 @@
 mod gallery;
 mod topics;
 
-pub use topics::{ANCHOR_FRAME, ORIGIN_FRAME, PREFIX, Publisher, motion_mask, surface_depth};
+pub use topics::{ANCHOR_FRAME, ORIGIN_FRAME, PREFIX, Published, Publisher, motion_mask, surface_depth};
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -155,11 +155,10 @@ impl Sink {
         write_tracks_csv(&place("tracks.csv"), &rows)?;
         write_tum(&place("trajectory.tum"), poses.iter().copied())?;
         std::fs::write(place("config.yaml"), config.to_yaml()).context("cannot write config.yaml")?;
-        let (mut withheld, mut left_out) = (0, 0);
-        if let Some(publisher) = publisher {
-            left_out = publisher.truncated;
-            withheld = publisher.finish(&cloud, origin, &poses, &config)?;
-        }
+        let published = match publisher {
+            Some(publisher) => publisher.finish(&cloud, origin, &poses, &config)?,
+            None => Published::default(),
+        };
         let mut timings = finished.timings;
         timings.merge(self.timings);
         let held_out = match scorer {
@@ -178,17 +177,18 @@ impl Sink {
             steps: finished.steps,
             steps_skipped: 0,
             dropped: counts.dropped,
+            messages_lost: counts.messages_lost,
             poses_rejected: counts.poses_rejected,
             non_finite_windows: counts.non_finite_windows,
-            nonfinite: 0,
-            withheld,
+            nonfinite: published.non_finite,
+            withheld: published.withheld,
             problems: counts.problems,
             latency_ms: timings.stats(),
             peak_rss_mb: peak_rss_mb(),
             wall_sec: wall.as_secs_f64(),
             recorded_sec: recorded_ns as f64 * 1e-9,
             gaussians: self.last_gaussians,
-            gaussians_left_out: left_out,
+            gaussians_left_out: published.truncated,
             map_gaussians: cloud.len() as u64,
             map_evicted: finished.map.counts().evicted,
             tracks: finished.tracks.len() as u64,

@@ -13,7 +13,9 @@ use crate::engine::select;
 use crate::map::color01;
 use crate::msg::{CameraInfo, Header, Image, PointCloud2, PoseStamped, TransformStamped};
 use crate::output::bag_writer::{BagWriter, TopicId};
-use crate::output::cloud::{FlowCloud, GaussianCloud, MapCloud, NO_TRACK, flow_cloud, gaussian_cloud, map_cloud};
+use crate::output::cloud::{
+    FlowCloud, GaussianCloud, MapCloud, NO_TRACK, flow_cloud, gaussian_cloud, map_cloud, non_finite_values,
+};
 use crate::output::picture::{Picture, mask_overlay};
 use crate::output::ply::PlyCloud;
 use crate::output::qos::Qos;
@@ -46,9 +48,19 @@ pub struct Publisher {
     tf: TopicId,
     tf_static: TopicId,
     cameras: Vec<CameraTopics>,
+    truncated: u64,
+    withheld: u64,
+    non_finite: u64,
+}
+
+/// What became of the values on their way out.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Published {
     /// Gaussians the size limit left out.
     pub truncated: u64,
-    /// Values that were not finite and were therefore not published.
+    /// Points that were not finite and were therefore not published.
+    pub withheld: u64,
+    /// Non-finite values in what was published all the same.
     pub non_finite: u64,
 }
 
@@ -74,7 +86,6 @@ impl Publisher {
         }
         let tf = bag.topic("/tf", MessageType::TfMessage, Qos::Reliable)?;
         let tf_static = bag.topic("/tf_static", MessageType::TfMessage, Qos::Latched)?;
-        let zero = 0;
         Ok(Self {
             bag,
             gaussians,
@@ -84,8 +95,9 @@ impl Publisher {
             tf,
             tf_static,
             cameras: per_camera,
-            truncated: zero,
-            non_finite: zero,
+            truncated: 0,
+            withheld: 0,
+            non_finite: 0,
         })
     }
 
@@ -126,7 +138,8 @@ impl Publisher {
                 track_ids: &vec![NO_TRACK; picked.len()],
             },
         )?;
-        self.non_finite += built.non_finite as u64;
+        self.withheld += built.non_finite as u64;
+        self.non_finite += non_finite_values(&built.cloud) as u64;
         Ok(built.cloud)
     }
 
@@ -146,7 +159,8 @@ impl Publisher {
             valid: &valid,
         };
         let built = flow_cloud(header, &cloud)?;
-        self.non_finite += built.non_finite as u64;
+        self.withheld += built.non_finite as u64;
+        self.non_finite += non_finite_values(&built.cloud) as u64;
         Ok(built.cloud)
     }
 
@@ -169,7 +183,9 @@ impl Publisher {
             step: (view.width * bytes_per_pixel) as u32,
             data,
         };
-        let depth: Vec<u8> = surface_depth(view).iter().flat_map(|d| d.to_le_bytes()).collect();
+        let depth = surface_depth(view);
+        self.non_finite += depth.iter().filter(|d| !d.is_finite()).count() as u64;
+        let depth: Vec<u8> = depth.iter().flat_map(|d| d.to_le_bytes()).collect();
         let topics = &self.cameras[camera];
         let messages = [
             (topics.rendered, encode::encode_image(&image("rgb8", 3, rgb))?),
@@ -188,7 +204,13 @@ impl Publisher {
     }
 
     /// Writes the map, its frame, and the trajectory, then the bag's index.
-    pub fn finish(mut self, map: &PlyCloud, origin: DVec3, poses: &[(i64, Rigid)], config: &Config) -> Result<u64> {
+    pub fn finish(
+        mut self,
+        map: &PlyCloud,
+        origin: DVec3,
+        poses: &[(i64, Rigid)],
+        config: &Config,
+    ) -> Result<Published> {
         let stamp_ns = poses.last().map_or(0, |(stamp, _)| *stamp);
         let map_frame = &config.input.map_frame;
         let still = transform(map_frame, ORIGIN_FRAME, stamp_ns, Rigid::new(glam::DQuat::IDENTITY, origin));
@@ -203,7 +225,8 @@ impl Publisher {
                 quats: &map.quats,
             },
         )?;
-        self.non_finite += built.non_finite as u64;
+        self.withheld += built.non_finite as u64;
+        self.non_finite += non_finite_values(&built.cloud) as u64;
         self.bag.write(self.map, stamp_ns, &encode::encode_point_cloud2(&built.cloud)?)?;
         let header = |stamp_ns: i64| Header { stamp_ns, frame_id: map_frame.clone() };
         let pose = |(stamp, pose): &(i64, Rigid)| PoseStamped {
@@ -214,7 +237,7 @@ impl Publisher {
         let path = crate::msg::Path { header: header(stamp_ns), poses: poses.iter().map(pose).collect() };
         self.bag.write(self.path, stamp_ns, &encode::encode_path(&path)?)?;
         self.bag.finish()?;
-        Ok(self.non_finite)
+        Ok(Published { truncated: self.truncated, withheld: self.withheld, non_finite: self.non_finite })
     }
 }
 
