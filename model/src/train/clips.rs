@@ -1,5 +1,7 @@
 //! Training clips from procedural drives: pictures, poses and ground truth in the window's anchor frame.
 
+use std::borrow::Borrow;
+
 use candle_core::{Device, Tensor};
 use glam::{Affine3A, DAffine3, DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -221,8 +223,9 @@ impl Shot {
 
 impl TrainClip {
     /// Several clips of the same sizes as one batch.
-    pub fn stack(clips: &[Self]) -> Result<Self, TrainError> {
-        let all = |pick: fn(&Self) -> ClipBatch| ClipBatch::stack(&clips.iter().map(pick).collect::<Vec<_>>());
+    pub fn stack<C: Borrow<Self>>(clips: &[C]) -> Result<Self, TrainError> {
+        let clips: Vec<&Self> = clips.iter().map(Borrow::borrow).collect();
+        let all = |pick: fn(&Self) -> ClipBatch| ClipBatch::stack(&clips.iter().map(|c| pick(c)).collect::<Vec<_>>());
         let targets: Vec<&(ClipBatch, Truth)> = clips.iter().filter_map(|c| c.target.as_ref()).collect();
         let target = if targets.is_empty() {
             None

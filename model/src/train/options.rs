@@ -6,6 +6,7 @@ use super::adamw::AdamOptions;
 use super::clips::ClipOptions;
 use super::error::TrainError;
 use super::losses::RenderLossOptions;
+use super::muon::Optimizer;
 use super::pixel::PixelLossOptions;
 use super::schedule::Schedule;
 
@@ -35,6 +36,9 @@ pub struct TrainOptions {
     pub stage: Stage,
     /// Learning rate.
     pub schedule: Schedule,
+    /// What moves the blocks' matrices.
+    #[serde(default)]
+    pub optimizer: Optimizer,
     /// AdamW and clipping.
     pub adam: AdamOptions,
     /// Moving average of the weights: how much of it stays per step.
@@ -47,6 +51,13 @@ pub struct TrainOptions {
     pub clips: ClipOptions,
     /// Steps with one camera before all cameras are used.
     pub one_camera_steps: u64,
+    /// How many times each clip is shown.
+    #[serde(default = "once")]
+    pub reuse: u64,
+}
+
+fn once() -> u64 {
+    1
 }
 
 impl TrainOptions {
@@ -59,12 +70,14 @@ impl TrainOptions {
             batch,
             stage: Stage::Pixel,
             schedule: Schedule { peak, warmup_steps, steps, end_share: 0.01 },
+            optimizer: Optimizer::AdamW,
             adam: AdamOptions::default(),
             average_decay: 0.999,
             pixel: PixelLossOptions::default(),
             render: RenderLossOptions::default(),
             clips: ClipOptions::default(),
             one_camera_steps: 0,
+            reuse: 1,
         }
     }
 
@@ -80,6 +93,7 @@ impl TrainOptions {
         }
         let peak = self.schedule.peak;
         rule(peak > 0.0 && peak <= 1.0, "lr", peak, "more than 0, at most 1")?;
+        rule((1..=1000).contains(&self.reuse), "reuse", self.reuse as f64, "1 to 1000")?;
         rule(self.schedule.steps > 0, "steps", 0.0, "at least 1")?;
         rule(unit.contains(&self.average_decay), "average_decay", self.average_decay, "0 to below 1")?;
         let a = &self.adam;
@@ -125,7 +139,7 @@ impl TrainOptions {
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
-            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera); batch {}, peak rate {:e}, schedule of {} steps",
+            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times; batch {}, {}, peak rate {:e}, schedule of {} steps",
             self.history,
             self.seed,
             c.cameras,
@@ -133,7 +147,12 @@ impl TrainOptions {
             c.width,
             c.height,
             self.one_camera_steps,
+            self.reuse,
             self.batch,
+            match self.optimizer {
+                Optimizer::AdamW => "AdamW",
+                Optimizer::Muon => "Muon and AdamW",
+            },
             self.schedule.peak,
             self.schedule.steps,
         )
