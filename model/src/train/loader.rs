@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use rand::SeedableRng;
 use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::clips::{ClipOptions, ClipPlan, TrainClip};
@@ -51,13 +51,30 @@ impl DataOptions {
         order.into_iter().skip((batch * size) as usize).take(self.batch).collect()
     }
 
+    /// The number of cameras of batch `index`: where it varies, one block of batches in six has one camera less than all, and
+    /// another one in six two less.
+    fn cameras(&self, index: u64) -> usize {
+        if index < self.one_camera_batches {
+            return 1;
+        }
+        let block = index / (BLOCK * self.reuse.max(1));
+        let all = self.clips.cameras;
+        if !self.clips.variety {
+            return all;
+        }
+        match ChaCha8Rng::seed_from_u64(self.seed ^ !block).random_range(0..6) {
+            less @ 1..=2 => all.saturating_sub(less).max(1),
+            _ => all,
+        }
+    }
+
     /// Batch `index` of the run.
     pub fn batch(&self, index: u64, config: &ModelConfig) -> Result<TrainClip, TrainError> {
         self.batch_with(index, config, &Kept::default())
     }
 
     fn batch_with(&self, index: u64, config: &ModelConfig, kept: &Kept) -> Result<TrainClip, TrainError> {
-        let cameras = if index < self.one_camera_batches { 1 } else { self.clips.cameras };
+        let cameras = self.cameras(index);
         let clips = ClipOptions { cameras, ..self.clips };
         let samples = self.samples(index);
         let lock = || kept.lock().unwrap_or_else(PoisonError::into_inner);

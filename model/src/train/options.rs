@@ -139,7 +139,7 @@ impl TrainOptions {
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
-            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times; batch {}, {}, peak rate {:e}, schedule of {} steps",
+            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
             self.history,
             self.seed,
             c.cameras,
@@ -148,6 +148,7 @@ impl TrainOptions {
             c.height,
             self.one_camera_steps,
             self.reuse,
+            if c.variety { ", varied lenses and numbers of cameras" } else { "" },
             self.batch,
             match self.optimizer {
                 Optimizer::AdamW => "AdamW",

@@ -79,6 +79,9 @@ pub struct Args {
     /// Steps with one camera before all are used.
     #[arg(long, default_value_t = 0)]
     one_camera_steps: u64,
+    /// Vary the lenses from clip to clip and the number of cameras, for weights that meet other rigs than the drives' own.
+    #[arg(long)]
+    variety: bool,
     /// How often each clip is shown, at least 1; driving a clip costs a quarter of learning from it.
     #[arg(long, default_value_t = 1)]
     reuse: u64,
@@ -220,6 +223,7 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
     };
     options.one_camera_steps = args.one_camera_steps;
     options.reuse = args.reuse;
+    options.clips.variety = args.variety;
     if let Some(x) = args.flow_weight {
         options.pixel.flow = x;
     }
