@@ -34,6 +34,30 @@ pub(crate) struct MotionHead {
 /// The picture whose pixel-wise stages are kept for comparison: timestep 0, camera 1 (camera 0 of one-camera windows).
 const PROBED_PICTURE: usize = 1;
 
+/// Pixels that go through the upsampler and the decoder at a time: their features stay in the processor's caches, and a whole
+/// window's would not fit in memory at full size.
+const PART_PIXELS: usize = 1 << 15;
+
+/// Pictures of one window that are decoded together.
+struct Part {
+    window: usize,
+    first: usize,
+    count: usize,
+}
+
+/// All pictures in order, in parts within one window; one by one where stages of one picture are asked for.
+fn parts(windows: usize, pictures: usize, pixels: usize, one_by_one: bool) -> Vec<Part> {
+    let most = if one_by_one { 1 } else { (PART_PIXELS / pixels.max(1)).max(1) };
+    let of_window = |window: usize| {
+        (0..pictures).step_by(most).map(move |k| Part {
+            window,
+            first: window * pictures + k,
+            count: most.min(pictures - k),
+        })
+    };
+    (0..windows).flat_map(of_window).collect()
+}
+
 /// Dot products of every row of `x` with every row of `rows`.
 fn product(x: &Tensor, rows: Tensor) -> candle_core::Result<Tensor> {
     linear(x, &Linear::new(rows, None), Activation::None, None)
@@ -86,20 +110,19 @@ impl MotionHead {
             stages.keep("motion_bases", bases);
         }
         let upsampler = self.upsampler.prepare()?;
-        let mut none = Stages::none();
         let (mut all_weights, mut all_velocities) = (Vec::new(), Vec::new());
-        // One picture at a time: pixel features of a whole window would not fit in memory at full size.
-        for picture in 0..b * t * v {
-            let probed = picture == PROBED_PICTURE.min(t * v - 1);
+        for Part { window, first, count } in parts(b, t * v, h * w, stages.asked()) {
+            let mut none = Stages::none();
+            let probed = first == PROBED_PICTURE.min(t * v - 1);
             let stages = if probed { &mut *stages } else { &mut none };
-            let features = upsampler.forward(&pictures.get(picture)?, grid, stages)?;
+            let tokens = pictures.narrow(0, first, count)?.reshape((count * grid.0 * grid.1, config.embed_dim))?;
+            let features = upsampler.forward(&tokens, grid, stages)?;
             let keys = self.keys.forward(&features)?;
             if stages.wants("motion_keys") {
-                stages.keep("motion_keys", &unnest(&keys, grid, levels)?);
+                stages.keep("motion_keys", &unnest(&keys, grid, levels)?.get(0)?);
             }
             let velocity = match &mixture {
                 Some((queries, bases)) => {
-                    let window = picture / (t * v);
                     let logits = product(&keys, queries.get(window)?)?;
                     let weights = softmax(&logits, config.tau)?;
                     let velocity = product(&weights, bases.get(window)?.t()?.contiguous()?)?;
@@ -110,9 +133,9 @@ impl MotionHead {
             };
             all_velocities.push(unnest(&velocity, grid, levels)?);
         }
-        let velocity = Tensor::stack(&all_velocities, 0)?.reshape((b, t, v, h, w, config.velocity_channels()))?;
+        let velocity = Tensor::cat(&all_velocities, 0)?.reshape((b, t, v, h, w, config.velocity_channels()))?;
         let weights = match all_weights.first() {
-            Some(first) => Some(Tensor::stack(&all_weights, 0)?.reshape((b, t, v, h, w, first.dim(2)?))?),
+            Some(first) => Some(Tensor::cat(&all_weights, 0)?.reshape((b, t, v, h, w, first.dim(3)?))?),
             None => None,
         };
         let (velocity_backward, velocity_forward) = match config.velocity {

@@ -81,7 +81,7 @@ fn the_anchor_is_the_front_camera_and_static_points_agree_between_pictures() {
 #[test]
 fn any_number_of_threads_gives_the_same_batches() {
     let config = Arc::new(ModelConfig::preset("tiny").unwrap());
-    let options = DataOptions { seed: 9, batch: 2, clips: small(), one_camera_batches: 1, reuse: 1 };
+    let options = DataOptions { seed: 9, batch: 2, clips: small(), one_camera_batches: 1, targets_from: 0, reuse: 1 };
     let run = |threads: usize, first: u64| {
         let mut loader = Loader::new(options.clone(), Arc::clone(&config), first, threads);
         (0..3).map(|_| loader.next_batch().unwrap()).collect::<Vec<_>>()
@@ -113,6 +113,7 @@ fn variety_changes_lenses_and_cameras_and_nothing_else() {
         batch: 1,
         clips: ClipOptions { variety: true, ..small() },
         one_camera_batches: 0,
+        targets_from: 0,
         reuse: 1,
     };
     let config = ModelConfig::preset("tiny").unwrap();

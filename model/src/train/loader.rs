@@ -27,6 +27,8 @@ pub struct DataOptions {
     pub clips: ClipOptions,
     /// Before this batch, clips have one camera.
     pub one_camera_batches: u64,
+    /// Before this batch, clips have no target pictures.
+    pub targets_from: u64,
     /// How many times each clip is shown, at least 1.
     pub reuse: u64,
 }
@@ -34,8 +36,8 @@ pub struct DataOptions {
 /// Batches of different clips before any is shown again; so many are kept in memory.
 const BLOCK: u64 = 32;
 
-/// Clips made so far in the block that is being shown, by sample and number of cameras.
-type Kept = Mutex<BTreeMap<(u64, usize), Arc<TrainClip>>>;
+/// Clips made so far in the block that is being shown, by sample, number of cameras and of targets.
+type Kept = Mutex<BTreeMap<(u64, usize, usize), Arc<TrainClip>>>;
 
 impl DataOptions {
     /// The samples of batch `index` of the run.
@@ -75,21 +77,23 @@ impl DataOptions {
 
     fn batch_with(&self, index: u64, config: &ModelConfig, kept: &Kept) -> Result<TrainClip, TrainError> {
         let cameras = self.cameras(index);
-        let clips = ClipOptions { cameras, ..self.clips };
+        let targets = if index < self.targets_from { 0 } else { self.clips.targets };
+        let clips = ClipOptions { cameras, targets, ..self.clips };
         let samples = self.samples(index);
         let lock = || kept.lock().unwrap_or_else(PoisonError::into_inner);
         let block = BLOCK * self.reuse.max(1);
         // Another thread may still be at the block before; then its clips are made once more, which costs time only.
         let first_kept = index / block * BLOCK * self.batch as u64;
-        lock().retain(|&(sample, seen_by), _| sample >= first_kept && seen_by == cameras);
+        lock().retain(|&(sample, seen_by, drawn), _| sample >= first_kept && (seen_by, drawn) == (cameras, targets));
         let made = samples.into_iter().map(|sample| {
-            let known = lock().get(&(sample, cameras)).cloned();
+            let key = (sample, cameras, targets);
+            let known = lock().get(&key).cloned();
             if let Some(clip) = known {
                 return Ok(clip);
             }
             let clip = Arc::new(ClipPlan::training(self.seed, sample, &clips).make(&clips, config)?);
             if self.reuse > 1 {
-                lock().insert((sample, cameras), Arc::clone(&clip));
+                lock().insert(key, Arc::clone(&clip));
             }
             Ok(clip)
         });
@@ -147,7 +151,7 @@ mod tests {
     use super::*;
 
     fn options(batch: usize, reuse: u64) -> DataOptions {
-        DataOptions { seed: 3, batch, clips: ClipOptions::default(), one_camera_batches: 0, reuse }
+        DataOptions { seed: 3, batch, clips: ClipOptions::default(), one_camera_batches: 0, targets_from: 0, reuse }
     }
 
     #[test]

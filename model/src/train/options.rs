@@ -18,7 +18,7 @@ pub enum Stage {
     Pixel,
     /// The paper's: pictures drawn at other times against what the cameras saw.
     Render,
-    /// Both sums together.
+    /// Both sums together, the rendering losses from [`TrainOptions::render_from`] on.
     Both,
 }
 
@@ -51,6 +51,9 @@ pub struct TrainOptions {
     pub clips: ClipOptions,
     /// Steps with one camera before all cameras are used.
     pub one_camera_steps: u64,
+    /// First step of [`Stage::Both`] that draws; before it only the pixels' truth is used.
+    #[serde(default)]
+    pub render_from: u64,
     /// How many times each clip is shown.
     #[serde(default = "once")]
     pub reuse: u64,
@@ -61,6 +64,11 @@ fn once() -> u64 {
 }
 
 impl TrainOptions {
+    /// What step `step` learns from.
+    pub fn stage_at(&self, step: u64) -> Stage {
+        if self.stage == Stage::Both && step < self.render_from { Stage::Pixel } else { self.stage }
+    }
+
     /// Options for `steps` steps of `batch` samples with everything else usual.
     pub fn new(seed: u64, steps: u64, batch: usize, peak: f64) -> Self {
         let warmup_steps = (steps / 20).min(5000);
@@ -77,6 +85,7 @@ impl TrainOptions {
             render: RenderLossOptions::default(),
             clips: ClipOptions::default(),
             one_camera_steps: 0,
+            render_from: 0,
             reuse: 1,
         }
     }
@@ -134,7 +143,11 @@ impl TrainOptions {
         }
         if self.stage != Stage::Pixel {
             let depth = if self.render.depth > 0.0 { "depth and sky labels" } else { "sky labels" };
-            labels.push(format!("render stage ({depth}, no flow labels)"));
+            let from = match (self.stage, self.render_from) {
+                (Stage::Both, from @ 1..) => format!(", from step {from} on"),
+                _ => String::new(),
+            };
+            labels.push(format!("render stage ({depth}, no flow labels{from})"));
         }
         let labels = labels.join(" + ");
         let c = &self.clips;
