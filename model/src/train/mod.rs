@@ -6,6 +6,7 @@ mod checkpoint;
 mod clip_tests;
 mod clips;
 mod error;
+mod groups;
 mod loader;
 pub mod losses;
 mod muon;

@@ -119,6 +119,7 @@ impl TrainOptions {
             ("sky_color", p.sky_color),
             ("velocity", p.velocity),
             ("flow", p.flow),
+            ("groups", p.groups),
             ("render depth", self.render.depth),
             ("sky_opacity", self.render.sky_opacity),
             ("render velocity", self.render.velocity),

@@ -76,6 +76,9 @@ pub struct Args {
     /// Cameras of a clip, 1 to 6.
     #[arg(long, default_value_t = 3)]
     cameras: usize,
+    /// First step of --stage both that draws pictures; before it only the pixels' truth is used.
+    #[arg(long, default_value_t = 0)]
+    render_from: u64,
     /// Steps with one camera before all are used.
     #[arg(long, default_value_t = 0)]
     one_camera_steps: u64,
@@ -222,6 +225,7 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         ..ClipOptions::default()
     };
     options.one_camera_steps = args.one_camera_steps;
+    options.render_from = args.render_from;
     options.reuse = args.reuse;
     options.clips.variety = args.variety;
     if let Some(x) = args.flow_weight {
