@@ -5,7 +5,7 @@
 //! one writer, so the result is the same for any number of threads.
 
 use super::project::Camera;
-use super::tile::TileInput;
+use super::tile::{FeatureRows, TileInput};
 use super::tiles::{TILE_H, TILE_W};
 use super::unblend::{MOMENTS, UnblendScratch, UpstreamRow, unblend_tile};
 use super::unproject::{ChunkGradients, UnprojectInput, unproject_chunk};
@@ -78,7 +78,7 @@ impl CpuRasterizer {
         gradients: &mut SplatGradients,
     ) -> Result<(), RasterError> {
         splats.validate()?;
-        let Self { settings, isa, chunks, tiles, rendered, stats } = self;
+        let Self { settings, isa, chunks, tiles, rendered, stats, .. } = self;
         let rendered = rendered.as_ref().ok_or(RasterError::NotRendered { what: "nothing" })?;
         check_request(rendered, splats, views)?;
         check_upstream(views, splats.feature_count, pictures, upstream)?;
@@ -112,8 +112,7 @@ impl CpuRasterizer {
                 chunks,
                 chunk_bits: rendered.chunk_bits,
                 view,
-                features: splats.features,
-                feature_count: splats.feature_count,
+                features: FeatureRows::all(splats.features, splats.feature_count),
                 alpha_cap,
             };
             scratch.reset(&input, &memory.end);

@@ -11,7 +11,7 @@ pub(crate) const PITCH: usize = TILE_W + WIDTH;
 /// Splats fetched together, so that their cache misses overlap.
 pub(crate) const BATCH: usize = 32;
 /// Numbers in a cache line.
-pub(crate) const LINE_FLOATS: usize = 16;
+const LINE_FLOATS: usize = 16;
 
 const _: () = assert!(TILE_W == u32::BITS as usize, "a row of a tile is one u32 of live pixels");
 
@@ -29,9 +29,42 @@ pub(crate) struct TileInput<'a> {
     /// log2 of the slots of a chunk.
     pub(crate) chunk_bits: u32,
     pub(crate) view: usize,
-    pub(crate) features: &'a [f32],
-    pub(crate) feature_count: usize,
+    pub(crate) features: FeatureRows<'a>,
     pub(crate) alpha_cap: f32,
+}
+
+/// The channels to draw of every Gaussian's row of features.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FeatureRows<'a> {
+    pub(crate) values: &'a [f32],
+    /// Channels of a Gaussian.
+    pub(crate) stride: usize,
+    /// First channel drawn.
+    pub(crate) first: usize,
+    /// Channels drawn.
+    pub(crate) count: usize,
+}
+
+impl<'a> FeatureRows<'a> {
+    /// All channels.
+    pub(crate) fn all(values: &'a [f32], count: usize) -> Self {
+        Self { values, stride: count, first: 0, count }
+    }
+
+    /// The drawn channels of Gaussian `id`.
+    #[inline(always)]
+    pub(crate) fn of(&self, id: u32) -> &'a [f32] {
+        &self.values[id as usize * self.stride + self.first..][..self.count]
+    }
+
+    /// Asks for them.
+    #[inline(always)]
+    pub(crate) fn prefetch(&self, id: u32) {
+        let first = id as usize * self.stride + self.first;
+        for at in (first..first + self.count).step_by(LINE_FLOATS) {
+            prefetch(self.values, at);
+        }
+    }
 }
 
 /// A splat cut to a tile.

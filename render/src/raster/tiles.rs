@@ -1,7 +1,8 @@
 //! Chunks of Gaussians to tile lists: each chunk is projected into all views and sorted by tile on its own, so that a
 //! tile finds its splats by visiting the chunks in order. No shared writes, and the same lists for any thread count.
 
-use super::project::{Block, Camera, Footprints, LANES, Rules};
+use super::loaded::{GROUP, Stored};
+use super::project::{Block, Camera, Centers, Footprints, LANES, Rules, Shapes};
 use super::simd::dispatch;
 use super::sort::key;
 use super::{MAX_PAIRS, Splats};
@@ -121,13 +122,54 @@ pub(crate) struct Chunk {
     starts: Vec<u32>,
     /// Sort keys, tile after tile, index order inside a tile.
     keys: Vec<u64>,
+    /// Which views may see the group at hand.
+    seen: Vec<bool>,
+    pub(crate) counts: ChunkCounts,
+}
+
+/// What a chunk's Gaussians came to.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct ChunkCounts {
+    /// Not usable; of kept Gaussians only those that have no place at the time drawn.
     pub(crate) invalid: usize,
+    /// Blended by the convention, summed over the views.
     pub(crate) visible: usize,
+    /// Of these, with a pixel that may reach 1/255.
+    pub(crate) listed: usize,
+    /// 3D covariances worked out.
+    pub(crate) shapes: usize,
+    /// Passed over by the bounds of their group, summed over the views.
+    pub(crate) unread: usize,
+}
+
+/// Where the Gaussians come from.
+#[derive(Clone, Copy)]
+pub(crate) enum Source<'a> {
+    /// The caller's arrays, seen for the first time.
+    Fresh(Splats<'a>),
+    /// Those kept, at a time.
+    Kept(&'a Stored, f32),
+}
+
+impl<'a> Source<'a> {
+    pub(crate) fn len(&self) -> usize {
+        match self {
+            Self::Fresh(splats) => splats.len(),
+            Self::Kept(stored, _) => stored.len(),
+        }
+    }
+
+    fn opacities(&self) -> &'a [f32] {
+        match self {
+            Self::Fresh(splats) => splats.opacities,
+            Self::Kept(stored, _) => stored.opacities(),
+        }
+    }
 }
 
 /// What all chunks share.
 pub(crate) struct ChunkInput<'a> {
-    pub(crate) splats: Splats<'a>,
+    pub(crate) source: Source<'a>,
     pub(crate) cameras: &'a [Camera],
     pub(crate) rules: Rules,
     pub(crate) grid: &'a Grid,
@@ -189,28 +231,75 @@ dispatch!(
 
 #[inline(always)]
 fn fill_chunk_kernel<const FMA: bool>(input: &ChunkInput, range: Range<usize>, first_slot: u32, chunk: &mut Chunk) {
-    let splats = &input.splats;
     chunk.views.resize_with(input.cameras.len(), ChunkView::default);
     for view in &mut chunk.views {
         view.records.clear();
         view.depths.clear();
         view.ids.clear();
     }
-    (chunk.invalid, chunk.visible) = (0, 0);
+    chunk.counts = ChunkCounts::default();
+    match &input.source {
+        Source::Fresh(splats) => fill_fresh::<FMA>(input, splats, range, chunk),
+        Source::Kept(stored, draw_sec) => fill_kept::<FMA>(input, stored, *draw_sec, range, chunk),
+    }
+    chunk.counts.listed = chunk.views.iter().map(|view| view.records.len()).sum();
+    chunk.bin(input, first_slot);
+}
+
+/// Reads every Gaussian of the range.
+#[inline(always)]
+fn fill_fresh<const FMA: bool>(input: &ChunkInput, splats: &Splats, range: Range<usize>, chunk: &mut Chunk) {
     let rows = range.start * splats.feature_count..range.end * splats.feature_count;
     let features_finite = all_finite(splats.features.get(rows).unwrap_or_default());
     let mut block = Block::new();
     let mut prints = Footprints::new();
     for start in range.clone().step_by(LANES) {
         let count = (range.end - start).min(LANES);
-        chunk.invalid += block.load(splats, start, count, features_finite);
+        chunk.counts.invalid += block.load(splats, start, count, features_finite);
+        chunk.counts.shapes += count;
         for (camera, view) in input.cameras.iter().zip(&mut chunk.views) {
-            if super::project::project::<FMA>(&block, camera, &input.rules, &mut prints) {
-                chunk.visible += view.keep(&block, &prints, splats, start);
+            let Block { centers, shapes } = &block;
+            if super::project::project::<FMA>(centers, shapes, camera, &input.rules, &mut prints) {
+                chunk.counts.visible += view.keep(shapes, &prints, splats.opacities, start);
             }
         }
     }
-    chunk.bin(input, first_slot);
+}
+
+/// Reads the groups of the range that some view may see.
+#[inline(always)]
+fn fill_kept<const FMA: bool>(
+    input: &ChunkInput,
+    stored: &Stored,
+    draw_sec: f32,
+    range: Range<usize>,
+    chunk: &mut Chunk,
+) {
+    let opacities = input.source.opacities();
+    let mut centers = Centers::new();
+    let mut prints = Footprints::new();
+    let Chunk { views, seen, counts, .. } = chunk;
+    for first in range.clone().step_by(GROUP) {
+        let end = (first + GROUP).min(range.end);
+        let bounds = stored.bounds(first, draw_sec);
+        seen.clear();
+        seen.extend(input.cameras.iter().map(|camera| bounds.is_some_and(|b| b.may_show(camera, &input.rules))));
+        let seeing = seen.iter().filter(|&&sees| sees).count();
+        counts.unread += (end - first) * (seen.len() - seeing);
+        if seeing == 0 {
+            continue;
+        }
+        for start in (first..end).step_by(LANES) {
+            let (shapes, lost) = stored.place(start, draw_sec, &mut centers);
+            counts.invalid += lost;
+            for ((camera, view), _) in input.cameras.iter().zip(views.iter_mut()).zip(&*seen).filter(|(_, sees)| **sees)
+            {
+                if super::project::project::<FMA>(&centers, shapes, camera, &input.rules, &mut prints) {
+                    counts.visible += view.keep(shapes, &prints, opacities, start);
+                }
+            }
+        }
+    }
 }
 
 /// True when no number is infinite or NaN: its exponent bits are not all ones.
@@ -264,7 +353,7 @@ impl ChunkView {
 
     /// Keeps the visible lanes that have a pixel to blend; returns how many lanes are visible.
     #[inline(always)]
-    fn keep(&mut self, block: &Block, prints: &Footprints, splats: &Splats, start: usize) -> usize {
+    fn keep(&mut self, shapes: &Shapes, prints: &Footprints, opacities: &[f32], start: usize) -> usize {
         let mut visible = 0;
         for l in 0..LANES {
             if !prints.visible[l] {
@@ -272,7 +361,7 @@ impl ChunkView {
             }
             visible += 1;
             let (x0, x1, y0, y1) = (prints.x0[l], prints.x1[l], prints.y0[l], prints.y1[l]);
-            let blended = block.reach2[l] >= 0.0 && x0 < x1 && y0 < y1;
+            let blended = shapes.reach2[l] >= 0.0 && x0 < x1 && y0 < y1;
             if !blended {
                 continue;
             }
@@ -284,7 +373,7 @@ impl ChunkView {
                 slope,
                 across,
                 along,
-                opacity: splats.opacities[id].min(super::settings::OPACITY_CEILING),
+                opacity: opacities[id].min(super::settings::OPACITY_CEILING),
                 x0: x0 as u16,
                 y0: y0 as u16,
                 x1: x1 as u16,
