@@ -1,7 +1,7 @@
 //! Gaussians kept between pictures: what no time and no view changes is worked out once.
 //!
 //! Motion moves centres only (paper eq. 1), so orientation, scale and opacity, hence the 3D covariance's root `R S` and
-//! the reach of the ellipse, are the same at all times. Beside them lie the bounds of every 64 consecutive Gaussians,
+//! the reach of the ellipse, are the same at all times. Beside them lie the bounds of every 32 consecutive Gaussians,
 //! which let a view pass over those it cannot see without reading them.
 
 use super::motion::Motion;
@@ -13,7 +13,7 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Consecutive Gaussians that share bounds: a stretch of one picture row where they are pixel-aligned.
-pub(crate) const GROUP: usize = 64;
+pub(crate) const GROUP: usize = 32;
 /// Rounding of moved centres in f32, as a share of their distance from the origin.
 const CENTER_SLACK: f64 = 1e-6;
 

@@ -143,8 +143,29 @@ pub(crate) fn low_bits(count: usize) -> u32 {
 #[inline(always)]
 pub(crate) fn is_live(live: &[u32; TILE_H], cut: &Cut) -> bool {
     let columns = low_bits(cut.x1 - cut.x0) << cut.x0;
-    live[cut.y0..cut.y1].iter().fold(0, |a, b| a | b) & columns != 0
+    // All rows, whatever the box: a loop over its few rows would end where the processor did not expect it.
+    let (first, end) = (&ROWS_BELOW[cut.y0.min(TILE_H)], &ROWS_BELOW[cut.y1.min(TILE_H)]);
+    let mut any = [0u32; TILE_H];
+    for y in 0..TILE_H {
+        any[y] = live[y] & end[y] & !first[y];
+    }
+    any.iter().fold(0, |a, b| a | b) & columns != 0
 }
+
+/// All ones for the rows below the index, 0 from there on.
+const ROWS_BELOW: [[u32; TILE_H]; TILE_H + 1] = {
+    let mut table = [[0; TILE_H]; TILE_H + 1];
+    let mut rows = 0;
+    while rows <= TILE_H {
+        let mut y = 0;
+        while y < rows {
+            table[rows][y] = u32::MAX;
+            y += 1;
+        }
+        rows += 1;
+    }
+    table
+};
 
 /// The chunk and the position in it that a key stands for.
 #[inline(always)]
