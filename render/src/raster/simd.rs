@@ -149,6 +149,9 @@ pub(crate) fn ln_lanes(x: &mut [f64; 8]) {
     const MANTISSA: u64 = (1 << 52) - 1;
     /// 2^52: its low mantissa bits hold a small whole number.
     const WHOLE: u64 = 0x4330_0000_0000_0000;
+    /// `1 / (2 k + 3)`.
+    const TERMS: [f64; 10] =
+        [1.0 / 3.0, 0.2, 1.0 / 7.0, 1.0 / 9.0, 1.0 / 11.0, 1.0 / 13.0, 1.0 / 15.0, 1.0 / 17.0, 1.0 / 19.0, 1.0 / 21.0];
     let (mut m, mut e) = ([0.0; 8], [0.0; 8]);
     for l in 0..8 {
         let shifted = x[l].to_bits().wrapping_sub(HALF_ROOT);
@@ -158,10 +161,11 @@ pub(crate) fn ln_lanes(x: &mut [f64; 8]) {
     for l in 0..8 {
         let s = (m[l] - 1.0) / (m[l] + 1.0);
         let z = s * s;
-        let mut sum = 1.0 / 21.0;
-        for odd in [19.0, 17.0, 15.0, 13.0, 11.0, 9.0, 7.0, 5.0, 3.0] {
-            sum = sum * z + 1.0 / odd;
-        }
+        // In two halves, so that no addition waits for all others.
+        let w = z * z;
+        let even = TERMS[0] + w * (TERMS[2] + w * (TERMS[4] + w * (TERMS[6] + w * TERMS[8])));
+        let odd = TERMS[1] + w * (TERMS[3] + w * (TERMS[5] + w * (TERMS[7] + w * TERMS[9])));
+        let sum = even + z * odd;
         x[l] = e[l] * std::f64::consts::LN_2 + 2.0 * (s + s * z * sum);
     }
 }

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Builds the OpenSplat peer of `storm bench --raster`: build.sh OPENSPLAT PYTHON OUT
+# Builds the OpenSplat peer of `raster_bench`: build.sh OPENSPLAT PYTHON OUT
 # OPENSPLAT: a checkout of OpenSplat (AGPL-3.0; not part of this program). PYTHON: one with PyTorch, whose libtorch is
-# linked. OUT: the program to write; pass it to `storm bench --raster --peer-opensplat OUT`.
+# linked. OUT: the program to write; pass it to `raster_bench --peer-opensplat OUT`.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 torch=$("$2" -c 'import os, torch; print(os.path.dirname(torch.__file__))')

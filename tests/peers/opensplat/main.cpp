@@ -1,4 +1,4 @@
-// Times the CPU rasteriser of OpenSplat (forward, one view) on a scene that `storm bench --raster` wrote.
+// Times the CPU rasteriser of OpenSplat (forward, one view) on a scene that `raster_bench` wrote.
 //
 //   peer SCENE REPEATS PICTURE
 //

@@ -205,10 +205,15 @@ fn faint_small_and_hidden_splats_cost_no_blending() {
     let (stats, faint) = work(&scene);
     assert_eq!((stats.visible, faint.listed, faint.blended, stats.pairs), (10, 0, 0, 0));
 
-    // Two hundred on one spot: thirteen or so at half opacity fill a pixel, the rest is hidden behind them.
-    let (stats, stacked) = work(&Scene::copies(200, 1));
-    assert_eq!(stats.pairs % 200, 0);
-    assert!(stacked.blended > 12 && stacked.blended < stats.pairs / 2, "{stacked:?}");
+    // A wall of four in front of two hundred: two fill every pixel (0.001^2 < 1e-4), nothing behind them is blended.
+    let mut hidden = Scene::copies(204, 1);
+    for i in 0..4 {
+        (hidden.means[i][2], hidden.scales[i], hidden.opacities[i]) = (4.0, [100.0; 3], 1.0);
+    }
+    let (stats, behind) = work(&hidden);
+    let tiles = 64 / TILE_W * 48 / TILE_H;
+    assert_eq!((stats.visible, behind.listed, behind.blended), (204, 204, 2 * tiles));
+    assert!(stats.pairs >= 200 + 4 * tiles);
     // So faint that all of them together leave every pixel open: none is hidden.
     let mut open = Scene::copies(200, 1);
     open.opacities.fill(0.02);
