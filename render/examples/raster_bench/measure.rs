@@ -19,6 +19,11 @@ impl Times {
         self.sorted_ms.get(self.sorted_ms.len() / 2).copied().unwrap_or(f64::NAN)
     }
 
+    /// Processor time of all threads, or the wall clock where it is not known.
+    pub fn busy_ms(&self) -> f64 {
+        self.cpu_ms.unwrap_or_else(|| self.median_ms())
+    }
+
     pub fn json(&self) -> Value {
         let best = self.sorted_ms.first();
         json!({"median_ms": self.median_ms(), "best_ms": best, "cpu_ms": self.cpu_ms, "repeats": self.sorted_ms.len()})
@@ -55,15 +60,15 @@ pub fn median(values: &[f64]) -> f64 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
-/// Processor time of this process so far, all threads, milliseconds; `None` where `/proc` does not say.
+/// Processor time of this process's threads so far, milliseconds; `None` where `/proc` does not say.
 fn cpu_ms() -> Option<f64> {
-    /// Linux reports these times in hundredths of a second.
-    const TICK_MS: f64 = 10.0;
-    let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // The fields after the command, which ends at the last parenthesis; user and system time are numbers 14 and 15.
-    let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
-    let ticks = |field: usize| fields.get(field)?.parse::<f64>().ok();
-    Some((ticks(11)? + ticks(12)?) * TICK_MS)
+    let threads = std::fs::read_dir("/proc/self/task").ok()?;
+    // The first number of a thread's schedstat: nanoseconds it has run.
+    let ran_ns = |thread: std::fs::DirEntry| -> Option<f64> {
+        std::fs::read_to_string(thread.path().join("schedstat")).ok()?.split_whitespace().next()?.parse().ok()
+    };
+    let total_ns: f64 = threads.filter_map(|thread| ran_ns(thread.ok()?)).sum();
+    (total_ns > 0.0).then_some(total_ns * 1e-6)
 }
 
 /// Peak rates of all cores, measured now.
