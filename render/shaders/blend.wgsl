@@ -2,17 +2,23 @@
 //
 // Algorithm: a workgroup is a tile, a thread a pixel. 256 splats at a time are fetched into workgroup memory and blended
 // by all pixels; the tile ends when no pixel is unfinished. The first dispatch also writes alpha and depth.
-// Bindings: 0 view, 1 chunk (`first` channel), 2 records, 3 slots (sorted by tile, then depth), 4 ranges, 5 features,
-//   6 features of the picture (out, row-major pixels x channels), 7 alpha of all pixels, then depth of all (out).
+// Bindings: 0 view, 1 chunk, 2 records, 3 slots (sorted by tile, then depth), 4 ranges, 5 the part of the features that
+//   the chunk's channels are in (row-major Gaussians x channels of the part), 6 the buffer of the picture's features that
+//   they go to (out, row-major pixels x channels of the buffer), 7 alpha of all pixels, then depth of all (out).
 // Equations: C = sum_i f_i alpha_i T_i, T_i = prod_{j<i} (1 - alpha_j) (Kerbl et al. 2023, eq. 3), expected depth
 // sum_i z_i w_i / max(sum_i w_i, 1e-10); alpha below 1/255 skipped, the splat that would bring T to 1e-4 ends the pixel
 // and is left out (gsplat).
 
+// The channels of this dispatch: where they are, how many (up to 4), where they go, and whether alpha and depth do too.
 struct Chunk {
-    first: u32,
+    source_first: u32,
+    source_stride: u32,
+    channels: u32,
+    out_first: u32,
+    out_stride: u32,
+    planes: u32,
     unused0: u32,
     unused1: u32,
-    unused2: u32,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -38,8 +44,8 @@ var<workgroup> range: vec2<u32>;
 var<workgroup> again: u32;
 
 fn feature(slot: u32, channel: u32) -> f32 {
-    if (channel < view.channels) {
-        return features[slot * view.channels + channel];
+    if (channel < chunk.channels) {
+        return features[slot * chunk.source_stride + chunk.source_first + channel];
     }
     return 0.0;
 }
@@ -74,9 +80,7 @@ fn blend(
             let r = records[slot];
             batch_shape[t] = vec4<f32>(r.u - corner.x, r.v - corner.y, r.slope, r.across);
             batch_rest[t] = vec4<f32>(r.along, r.opacity, r.depth, 0.0);
-            let c = chunk.first;
-            batch_features[t] =
-                vec4<f32>(feature(slot, c), feature(slot, c + 1u), feature(slot, c + 2u), feature(slot, c + 3u));
+            batch_features[t] = vec4<f32>(feature(slot, 0u), feature(slot, 1u), feature(slot, 2u), feature(slot, 3u));
         }
         workgroupBarrier();
         let count = min(BATCH, span.y - start);
@@ -115,13 +119,13 @@ fn blend(
         return;
     }
     let at = y * view.width + x;
-    if (chunk.first == 0u) {
+    if (chunk.planes == 1u) {
         out_planes[at] = min(weight_sum, 1.0);
         out_planes[view.width * view.height + at] = weighted_depth / max(weight_sum, ALPHA_FLOOR);
     }
     for (var k = 0u; k < 4u; k++) {
-        if (chunk.first + k < view.channels) {
-            out_features[at * view.channels + chunk.first + k] = clamp(color[k], -LARGEST, LARGEST);
+        if (k < chunk.channels) {
+            out_features[at * chunk.out_stride + chunk.out_first + k] = clamp(color[k], -LARGEST, LARGEST);
         }
     }
 }

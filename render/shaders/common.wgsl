@@ -29,7 +29,8 @@ struct View {
     // 0: Convention::Pinned, 1: Convention::Latest.
     convention: u32,
     splats: u32,
-    channels: u32,
+    // Where the Gaussians are, seconds.
+    time: f32,
     width: u32,
     height: u32,
     columns: u32,

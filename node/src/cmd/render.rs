@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use glam::{DQuat, DVec3, EulerRot, Vec3};
-use storm_render::raster::{CpuRasterizer, Picture as RasterPicture, RasterSettings, Splats};
+use storm_render::raster::{Channels, CpuRasterizer, Loaded, Motion, Picture as RasterPicture, RasterSettings, Splats};
 use storm_render::{Intrinsics, Renderer, View};
 
 use super::{Outcome, UsageError};
@@ -98,10 +98,12 @@ pub fn run(args: &Args) -> Result<Outcome> {
     let intrinsics = Intrinsics::from_fov(args.fov, args.width, args.height);
     let mut raster = renderer(&args.device)?;
     tracing::info!("drawing on {}", raster.describe());
+    let (loaded, channels) = load_splats(&mut *raster, &saved, args.what)?;
     let mut one = |pose: &Rigid, out: &Path| -> Result<bool> {
         let local_from_camera = saved.map_from_local.inverse() * *pose * crate::window::camera_from_flu().inverse();
         let view = View::from_pose(local_from_camera.to_f32(), intrinsics);
-        let picture = draw(&mut *raster, &saved, &view, args.time)?;
+        let pictures = raster.draw(loaded, args.time, &channels, std::slice::from_ref(&view))?;
+        let picture = pictures.into_iter().next().context("the rasteriser gave no picture")?;
         finish(&picture, args.what)?.write_png(out).with_context(|| format!("cannot write {}", out.display()))?;
         Ok(picture.alpha.iter().any(|&a| a > 0.0))
     };
@@ -155,33 +157,41 @@ fn load(path: &Path, step: Option<usize>) -> Result<SavedGaussians> {
 /// Channels in front of the motion groups': colour 3, velocity 3.
 const BASE_CHANNELS: usize = 6;
 
-/// Colour, velocity and one channel per motion group, depth and coverage.
-fn draw(raster: &mut dyn Renderer, saved: &SavedGaussians, view: &View, time_sec: f32) -> Result<RasterPicture> {
+/// Hands the Gaussians to the renderer, once for all pictures, and says which channels these need: of colour, velocity and
+/// one for each motion group.
+fn load_splats(raster: &mut dyn Renderer, saved: &SavedGaussians, what: What) -> Result<(Loaded, Channels)> {
     let cloud = &saved.cloud;
     let still = [0.0f32; 3];
-    let velocity = |i: usize| saved.velocities.get(i).unwrap_or(&still);
-    let move_by =
-        |(i, p): (usize, &[f32; 3])| -> [f32; 3] { std::array::from_fn(|k| p[k] + time_sec * velocity(i)[k]) };
-    let means: Vec<[f32; 3]> = cloud.positions.iter().enumerate().map(move_by).collect();
+    let velocities: Vec<[f32; 3]> = (0..cloud.len()).map(|i| *saved.velocities.get(i).unwrap_or(&still)).collect();
     let groups = saved.motion_ids.iter().max().map_or(0, |&m| usize::from(m) + 1);
     let feature_count = BASE_CHANNELS + groups;
     let mut features = vec![0.0; feature_count * cloud.len()];
     for (i, row) in features.chunks_exact_mut(feature_count).enumerate() {
         row[..3].copy_from_slice(&cloud.colors01[i]);
-        row[3..BASE_CHANNELS].copy_from_slice(velocity(i));
+        row[3..BASE_CHANNELS].copy_from_slice(&velocities[i]);
         if let Some(&group) = saved.motion_ids.get(i) {
             row[BASE_CHANNELS + usize::from(group)] = 1.0;
         }
     }
     let splats = Splats {
-        means: &means,
+        means: &cloud.positions,
         quats: &cloud.quats,
         scales: &cloud.scales,
         opacities: &cloud.opacities,
         features: &features,
         feature_count,
     };
-    raster.render(&splats, std::slice::from_ref(view))?.pop().context("the rasteriser gave no picture")
+    let time_sec = vec![0.0; cloud.len()];
+    let motion =
+        Motion { velocity_backward: &velocities, velocity_forward: &velocities, time_sec: time_sec.as_slice() };
+    let moves = velocities.iter().flatten().any(|&v| v != 0.0);
+    let channels = match what {
+        What::Color => 0..3,
+        What::Depth => 0..0,
+        What::Flow => 3..BASE_CHANNELS,
+        What::Mask => 0..feature_count,
+    };
+    Ok((raster.load(&splats, moves.then_some(&motion))?, Channels(channels)))
 }
 
 fn finish(p: &RasterPicture, what: What) -> Result<Picture> {
@@ -207,7 +217,7 @@ fn finish(p: &RasterPicture, what: What) -> Result<Picture> {
             mask_overlay(&Picture::from_rgb01(w, h, &channels(0).flatten().collect::<Vec<_>>())?, &ids)?
         }
         What::Flow => {
-            let flow: Vec<[f32; 3]> = channels(3).collect();
+            let flow: Vec<[f32; 3]> = channels(0).collect();
             with_flow_wheel(&flow_picture(w, h, &flow, None, FULL_SPEED_MPS)?, FULL_SPEED_MPS)
         }
     })

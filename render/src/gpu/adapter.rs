@@ -10,6 +10,8 @@ pub struct GpuOptions {
     pub adapter_name: Option<String>,
     /// Take buffers as large as the adapter allows; without, 128 MiB, which every adapter has.
     pub large_buffers: bool,
+    /// Treat bindings as no larger than this, bytes: for tests of what does not fit one, and devices that are shared.
+    pub binding_bytes: Option<u64>,
 }
 
 /// An adapter and what is asked of it.
@@ -80,6 +82,9 @@ pub(super) fn choose(options: &GpuOptions) -> Result<Choice, GpuError> {
         let most = adapter.limits();
         limits.max_storage_buffer_binding_size = most.max_storage_buffer_binding_size;
         limits.max_buffer_size = most.max_buffer_size;
+    }
+    if let Some(most) = options.binding_bytes {
+        limits.max_storage_buffer_binding_size = limits.max_storage_buffer_binding_size.min(most);
     }
     let features = adapter.features() & Features::TIMESTAMP_QUERY;
     Ok(Choice { adapter, features, limits })

@@ -1,6 +1,6 @@
 //! One view as commands: project, sort, list, sort, blend.
 
-use super::blend::chunk_words;
+use super::blend::{Plan, parts_of};
 use super::buffers::Grown;
 use super::device::Gpu;
 use super::error::GpuError;
@@ -11,6 +11,7 @@ use super::sort::{ARGS_BYTES, BLOCK, Lists};
 use super::timings::{Clock, Stage};
 use crate::camera::View;
 use crate::raster::{MAX_PAIRS, RasterSettings};
+use std::ops::Range;
 use wgpu::{BufferUsages, CommandEncoder, ComputePass};
 
 /// Bytes of `Record` and of a span in the shaders.
@@ -35,8 +36,11 @@ pub(super) struct Work {
     pub(super) by_depth: Lists,
     pub(super) by_tile: Lists,
     pub(super) ranges: Grown,
-    pub(super) out_features: Grown,
+    /// One buffer or, where a binding cannot hold all channels, more.
+    pub(super) out_features: Vec<Grown>,
     pub(super) out_planes: Grown,
+    /// How the channels of the batch at hand go through the buffers.
+    pub(super) plan: Plan,
     /// Entries the tile lists have room for.
     pub(super) capacity: u32,
 }
@@ -64,16 +68,33 @@ impl Work {
             by_depth: Lists::new(gpu, "bytes of depth keys", "bytes of depth order"),
             by_tile: Lists::new(gpu, "bytes of tile keys", "bytes of tile lists"),
             ranges: storage("bytes of tile ranges"),
-            out_features: storage("bytes of a picture's features"),
+            out_features: Vec::new(),
             out_planes: storage("bytes of a picture's alpha and depth"),
+            plan: Plan::default(),
             capacity: 0,
         })
     }
 
     /// Makes room for these views of the scene, with at least `pairs` entries in the tile lists.
-    pub(super) fn reserve(&mut self, gpu: &Gpu, scene: &Scene, views: &[View], pairs: u64) -> Result<(), GpuError> {
+    pub(super) fn reserve(
+        &mut self,
+        gpu: &Gpu,
+        scene: &Scene,
+        channels: &Range<usize>,
+        views: &[View],
+        pairs: u64,
+    ) -> Result<(), GpuError> {
         let n = u64::from(scene.splats);
-        let channels = u64::from(scene.channels);
+        let largest = views.iter().map(pixels_of).max().unwrap_or(0);
+        self.plan = Plan::new(gpu, &parts_of(scene), channels, largest)?;
+        let buffers = self.plan.outs.len().max(1);
+        while self.out_features.len() < buffers {
+            self.out_features.push(Grown::storage(gpu, "bytes of a picture's features"));
+        }
+        for (buffer, &channels) in self.out_features.iter_mut().zip(&self.plan.outs) {
+            buffer.reserve(gpu, (4 * largest).saturating_mul(u64::from(channels)))?;
+        }
+        self.out_planes.reserve(gpu, 8 * largest)?;
         self.records.reserve(gpu, RECORD_BYTES * n)?;
         self.spans.reserve(gpu, SPAN_BYTES * n)?;
         self.by_depth.reserve(gpu, n)?;
@@ -91,10 +112,7 @@ impl Work {
         self.sums.reserve(gpu, 4 * 16 * blocks)?;
         for view in views {
             let tiles = tiles_of(view).iter().map(|&side| u64::from(side)).product::<u64>();
-            let pixels = (view.intrinsics.width * view.intrinsics.height) as u64;
             self.ranges.reserve(gpu, 8 * tiles)?;
-            self.out_planes.reserve(gpu, 8 * pixels)?;
-            self.out_features.reserve(gpu, (4 * pixels).saturating_mul(channels))?;
         }
         Ok(())
     }
@@ -107,14 +125,19 @@ impl Work {
         scene: &Scene,
         views: &[View],
     ) -> Result<(), GpuError> {
-        let params = views.iter().map(|v| ViewParams::new(v, settings, scene.splats, scene.channels, self.capacity));
+        let params = views.iter().map(|v| ViewParams::new(v, settings, scene.splats, self.capacity));
         self.views.upload(gpu, &strided(params))?;
-        self.chunks.upload(gpu, &strided(chunk_words(scene.channels as usize)))
+        self.chunks.upload(gpu, &strided(self.plan.words()))
     }
 
     pub(super) fn step(&self, step: Step) -> wgpu::BindingResource<'_> {
         self.steps.entry(step.offset(), size_of::<[u32; 4]>() as u64)
     }
+}
+
+/// Pixels of a view's picture.
+pub(super) fn pixels_of(view: &View) -> u64 {
+    (view.intrinsics.width * view.intrinsics.height) as u64
 }
 
 /// Most entries of tile lists on this device.
@@ -162,10 +185,10 @@ impl Frame<'_> {
         let (kernel, scene, work) = (&self.kernels.project, self.scene, self.work);
         let buffers = [
             (0, self.view()),
-            (1, scene.means.all()),
+            (1, scene.means_now().all()),
             (2, scene.quats.all()),
             (3, scene.scales.all()),
-            (4, scene.solid.all()),
+            (4, scene.solid_now().all()),
             (5, work.records.all()),
             (6, work.spans.all()),
             (7, work.totals.all()),

@@ -1,7 +1,7 @@
 //! Splatting through wgpu: the forward rasteriser of [`raster`](crate::raster) in WGSL, on any Vulkan, Metal, DirectX 12
 //! or GLES device, without a window.
 //!
-//! The data's way: `scene` (upload, usable Gaussians) -> per view in `frame`: project -> `sort` (visible splats by depth,
+//! The data's way: `scene` (upload, usable Gaussians; where they are at a time) -> per view in `frame`: project -> `sort` (visible splats by depth,
 //! their tiles by number) -> `blend` (16x16 tiles, front to back) -> `readback`. The shaders lie in `render/shaders`;
 //! each says its algorithm, bindings and equation. Buffers stay on the device and grow when needed. Only the limits of
 //! WebGPU are asked for, and no subgroup operations.
@@ -25,13 +25,17 @@ pub use error::{GpuError, SOFTWARE_ADAPTER};
 pub use timings::GpuTimings;
 
 use crate::camera::View;
-use crate::raster::{CpuRasterizer, MAX_VIEWS, Picture, RasterError, RasterSettings, RasterStats, Splats};
+use crate::raster::{
+    Channels, CpuRasterizer, Loaded, MAX_VIEWS, Motion, Picture, RasterError, RasterSettings, RasterStats, Splats,
+    validate_time,
+};
 use crate::renderer::{RenderError, Renderer};
 use device::Gpu;
 use frame::{Frame, Work};
 use pipelines::Pipelines;
 use readback::{BATCH_VIEWS, Outcome, Staging, batch_len};
 use scene::Scene;
+use std::ops::Range;
 use timings::Clock;
 
 /// The forward rasteriser on a device; owns the device and its buffers.
@@ -47,6 +51,8 @@ pub struct GpuRasterizer {
     judge: CpuRasterizer,
     stats: RasterStats,
     timings: GpuTimings,
+    /// Name of what is on the device, while it may be drawn by it.
+    loaded: Option<Loaded>,
 }
 
 impl GpuRasterizer {
@@ -63,7 +69,7 @@ impl GpuRasterizer {
         let clock = Clock::new(&gpu, BATCH_VIEWS);
         gpu.check()?;
         let (stats, timings) = (RasterStats::default(), GpuTimings::default());
-        Ok(Self { gpu, kernels, scene, work, staging, clock, settings, judge, stats, timings })
+        Ok(Self { gpu, kernels, scene, work, staging, clock, settings, judge, stats, timings, loaded: None })
     }
 
     /// The settings in use.
@@ -91,25 +97,35 @@ impl GpuRasterizer {
     /// # Errors
     /// Arrays that do not fit together or do not fit the device, or a device that failed or is lost.
     pub fn upload(&mut self, splats: &Splats) -> Result<(), RenderError> {
-        splats.validate()?;
-        self.gpu.check()?;
-        Ok(self.scene.upload(&self.gpu, &self.kernels, splats)?)
+        self.take_over(splats, None)
     }
 
-    /// Renders views of the splats uploaded last.
+    fn take_over(&mut self, splats: &Splats, motion: Option<&Motion>) -> Result<(), RenderError> {
+        splats.validate()?;
+        motion.map_or(Ok(()), |motion| motion.validate(splats.len()))?;
+        self.gpu.check()?;
+        self.loaded = None;
+        Ok(self.scene.upload(&self.gpu, &self.kernels, splats, motion)?)
+    }
+
+    /// Renders views of the splats uploaded last, with all their channels, where they were put last.
     ///
     /// # Errors
     /// Cameras that cannot take a picture, views too large for the device, or a device that failed or is lost.
     pub fn render_uploaded(&mut self, views: &[View]) -> Result<Vec<Picture>, RenderError> {
-        self.judge_views(views)?;
+        self.render_channels(0..self.scene.channels as usize, views)
+    }
+
+    fn render_channels(&mut self, channels: Range<usize>, views: &[View]) -> Result<Vec<Picture>, RenderError> {
+        self.judge_views(channels.len(), views)?;
         self.gpu.check()?;
         let mut stats = RasterStats { splats: self.scene.splats as usize, ..RasterStats::default() };
         let mut timings = GpuTimings::default();
         let mut pictures = Vec::with_capacity(views.len());
         let mut rest = views;
         while !rest.is_empty() {
-            let (batch, after) = rest.split_at(batch_len(rest, self.scene.channels));
-            let (outcomes, invalid) = self.render_batch(batch, &mut timings)?;
+            let (batch, after) = rest.split_at(batch_len(rest, channels.len() as u32));
+            let (outcomes, invalid) = self.render_batch(&channels, batch, &mut timings)?;
             stats.invalid = invalid as usize;
             for outcome in outcomes {
                 stats.visible += outcome.visible as usize;
@@ -124,15 +140,20 @@ impl GpuRasterizer {
     }
 
     /// Renders one batch; once more with larger tile lists when a view needs them.
-    fn render_batch(&mut self, views: &[View], timings: &mut GpuTimings) -> Result<(Vec<Outcome>, u32), GpuError> {
+    fn render_batch(
+        &mut self,
+        channels: &Range<usize>,
+        views: &[View],
+        timings: &mut GpuTimings,
+    ) -> Result<(Vec<Outcome>, u32), GpuError> {
         let mut pairs = 0;
         loop {
-            self.work.reserve(&self.gpu, &self.scene, views, pairs)?;
+            self.work.reserve(&self.gpu, &self.scene, channels, views, pairs)?;
             self.work.write_params(&self.gpu, &self.settings, &self.scene, views)?;
-            self.staging.reserve(&self.gpu, views, self.scene.channels)?;
+            self.staging.reserve(&self.gpu, views, channels.len() as u32)?;
             self.submit(views);
             let before = *timings;
-            let (outcomes, invalid) = self.staging.read(&self.gpu, views, self.scene.channels, timings)?;
+            let (outcomes, invalid) = self.staging.read(&self.gpu, views, &self.work.plan, timings)?;
             pairs = outcomes.iter().map(|o| u64::from(o.pairs)).max().unwrap_or(0);
             if pairs <= u64::from(self.work.capacity) {
                 return Ok((outcomes, invalid));
@@ -156,17 +177,22 @@ impl GpuRasterizer {
                 index,
             };
             frame.encode(&mut encoder, self.clock.as_ref());
-            end = self.staging.copy(&mut encoder, &self.work, camera, self.scene.channels, end);
+            end = self.staging.copy(&mut encoder, &self.work, camera, end);
         }
-        self.staging.copy_shared(&mut encoder, &self.scene.invalid, self.clock.as_ref(), views.len(), end);
+        self.staging.copy_shared(
+            &mut encoder,
+            [&self.scene.invalid, &self.scene.lost],
+            self.clock.as_ref(),
+            views.len(),
+            end,
+        );
         self.gpu.queue.submit([encoder.finish()]);
     }
 
-    fn judge_views(&self, views: &[View]) -> Result<(), RasterError> {
+    fn judge_views(&self, feature_count: usize, views: &[View]) -> Result<(), RasterError> {
         if views.len() > MAX_VIEWS {
             return Err(RasterError::TooMany { name: "views", value: views.len(), limit: MAX_VIEWS });
         }
-        let feature_count = self.scene.channels as usize;
         let nothing = Splats { means: &[], quats: &[], scales: &[], opacities: &[], features: &[], feature_count };
         for (index, view) in views.iter().enumerate() {
             self.judge.project(&nothing, view).map_err(|error| match error {
@@ -182,6 +208,31 @@ impl Renderer for GpuRasterizer {
     fn render(&mut self, splats: &Splats, views: &[View]) -> Result<Vec<Picture>, RenderError> {
         self.upload(splats)?;
         self.render_uploaded(views)
+    }
+
+    fn load(&mut self, splats: &Splats, motion: Option<&Motion>) -> Result<Loaded, RenderError> {
+        self.take_over(splats, motion)?;
+        let name = Loaded::new();
+        self.loaded = Some(name);
+        Ok(name)
+    }
+
+    fn draw(
+        &mut self,
+        loaded: Loaded,
+        time_sec: f32,
+        channels: &Channels,
+        views: &[View],
+    ) -> Result<Vec<Picture>, RenderError> {
+        if self.loaded != Some(loaded) {
+            return Err(RasterError::NotLoaded.into());
+        }
+        channels.validate(self.scene.channels as usize)?;
+        validate_time(time_sec)?;
+        self.judge_views(channels.0.len(), views)?;
+        self.gpu.check()?;
+        self.scene.place(&self.gpu, &self.kernels, time_sec)?;
+        self.render_channels(channels.0.clone(), views)
     }
 
     fn describe(&self) -> String {

@@ -30,7 +30,7 @@ pub(super) struct ViewParams {
     alpha_cap: f32,
     convention: u32,
     splats: u32,
-    channels: u32,
+    time: f32,
     width: u32,
     height: u32,
     columns: u32,
@@ -40,13 +40,13 @@ pub(super) struct ViewParams {
 }
 
 impl ViewParams {
-    /// What `check.wgsl` reads.
-    pub(super) fn of_scene(splats: u32, channels: u32) -> Self {
-        Self { splats, channels, ..Self::default() }
+    /// What `motion.wgsl` reads.
+    pub(super) fn of_time(splats: u32, time: f32) -> Self {
+        Self { splats, time, ..Self::default() }
     }
 
     /// A validated view of a scene whose tile lists have room for `capacity` entries.
-    pub(super) fn new(view: &View, settings: &RasterSettings, splats: u32, channels: u32, capacity: u32) -> Self {
+    pub(super) fn new(view: &View, settings: &RasterSettings, splats: u32, capacity: u32) -> Self {
         let columns_of_pose = view.camera_from_world.matrix3.to_cols_array_2d();
         let translation = view.camera_from_world.translation.to_array();
         let k = &view.intrinsics;
@@ -82,7 +82,7 @@ impl ViewParams {
             alpha_cap: settings.convention.alpha_cap(),
             convention: u32::from(settings.convention == Convention::Latest),
             splats,
-            channels,
+            time: 0.0,
             width: k.width as u32,
             height: k.height as u32,
             columns,

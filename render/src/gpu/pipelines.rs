@@ -60,6 +60,7 @@ impl Kernel {
 /// All of them.
 pub(super) struct Pipelines {
     pub(super) check: Kernel,
+    pub(super) move_means: Kernel,
     pub(super) project: Kernel,
     pub(super) reduce_drawn: Kernel,
     pub(super) reduce_tiles: Kernel,
@@ -84,6 +85,7 @@ impl Pipelines {
         let kernel = |module: &wgpu::ShaderModule, entry: &str| Kernel::new(gpu, module, entry);
         let pipelines = Self {
             check: kernel(&module(&shaders::CHECK), "check"),
+            move_means: kernel(&module(&shaders::MOTION), "move_means"),
             project: kernel(&module(&shaders::PROJECT), "project"),
             reduce_drawn: kernel(&scan, "reduce_drawn"),
             reduce_tiles: kernel(&scan, "reduce_tiles"),

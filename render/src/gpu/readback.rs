@@ -1,9 +1,10 @@
 //! Pictures and counts from the device to the host, for a batch of views at once.
 
+use super::blend::Plan;
 use super::buffers::Grown;
 use super::device::Gpu;
 use super::error::GpuError;
-use super::frame::{TOTALS_BYTES, Work};
+use super::frame::{TOTALS_BYTES, Work, pixels_of};
 use super::timings::{Clock, GpuTimings};
 use crate::camera::View;
 use crate::raster::Picture;
@@ -37,7 +38,7 @@ pub(super) struct Staging {
 }
 
 fn place(view: &View, channels: u32, start: u64) -> Place {
-    let pixels = (view.intrinsics.width * view.intrinsics.height) as u64;
+    let pixels = pixels_of(view);
     let planes = start + TOTALS_BYTES;
     let features = planes + 8 * pixels;
     // Timestamps follow somewhere: eight bytes each.
@@ -67,36 +68,34 @@ impl Staging {
     }
 
     /// Records the copy of one view's results; returns where the next begins.
-    pub(super) fn copy(
-        &self,
-        encoder: &mut CommandEncoder,
-        work: &Work,
-        view: &View,
-        channels: u32,
-        start: u64,
-    ) -> u64 {
+    pub(super) fn copy(&self, encoder: &mut CommandEncoder, work: &Work, view: &View, start: u64) -> u64 {
         let to = self.buffer.raw();
-        let at = place(view, channels, start);
-        let pixels = (view.intrinsics.width * view.intrinsics.height) as u64;
+        let at = place(view, work.plan.channels(), start);
+        let pixels = pixels_of(view);
         encoder.copy_buffer_to_buffer(work.totals.raw(), 0, to, at.totals, TOTALS_BYTES);
         encoder.copy_buffer_to_buffer(work.out_planes.raw(), 0, to, at.planes, 8 * pixels);
-        if channels > 0 {
+        let mut offset = at.features;
+        for (buffer, &channels) in work.out_features.iter().zip(&work.plan.outs) {
             let bytes = 4 * pixels * u64::from(channels);
-            encoder.copy_buffer_to_buffer(work.out_features.raw(), 0, to, at.features, bytes);
+            encoder.copy_buffer_to_buffer(buffer.raw(), 0, to, offset, bytes);
+            offset += bytes;
         }
         at.end
     }
 
-    /// Records the copy of what the batch shares: the count of unusable Gaussians and the timestamps.
+    /// Records the copy of what the batch shares: the counts of Gaussians that are not drawn and the timestamps.
     pub(super) fn copy_shared(
         &self,
         encoder: &mut CommandEncoder,
-        invalid: &Grown,
+        counts: [&Grown; 2],
         clock: Option<&Clock>,
         views: usize,
         start: u64,
     ) {
-        encoder.copy_buffer_to_buffer(invalid.raw(), 0, self.buffer.raw(), start, TOTALS_BYTES);
+        let each = TOTALS_BYTES / 2;
+        for (index, count) in counts.into_iter().enumerate() {
+            encoder.copy_buffer_to_buffer(count.raw(), 0, self.buffer.raw(), start + index as u64 * each, each);
+        }
         if let Some(clock) = clock {
             clock.copy(encoder, views, self.buffer.raw(), start + TOTALS_BYTES);
         }
@@ -107,7 +106,7 @@ impl Staging {
         &self,
         gpu: &Gpu,
         views: &[View],
-        channels: u32,
+        plan: &Plan,
         timings: &mut GpuTimings,
     ) -> Result<(Vec<Outcome>, u32), GpuError> {
         let results = self.map(gpu).and_then(|()| {
@@ -115,16 +114,16 @@ impl Staging {
             let mut start = 0;
             let mut outcomes = Vec::with_capacity(views.len());
             for view in views {
-                let at = place(view, channels, start);
-                outcomes.push(take(gpu, &bytes, view, channels, &at)?);
+                let at = place(view, plan.channels(), start);
+                outcomes.push(take(gpu, &bytes, view, plan, &at)?);
                 start = at.end;
             }
-            let invalid = words::<u32>(gpu, &bytes, start..start + 4)?;
+            let counts = words::<u32>(gpu, &bytes, start..start + TOTALS_BYTES)?;
             if let Some(tick_ns) = gpu.tick_ns {
                 let first = start + TOTALS_BYTES;
                 timings.add(&words(gpu, &bytes, first..first + Clock::bytes(views.len()))?, tick_ns);
             }
-            Ok((outcomes, invalid.first().copied().unwrap_or(0)))
+            Ok((outcomes, counts.iter().step_by(2).fold(0u32, |sum, &count| sum.saturating_add(count))))
         });
         // Also after an error: a buffer that is still waiting to be mapped could not be used again.
         self.buffer.raw().unmap();
@@ -148,22 +147,41 @@ impl Staging {
     }
 }
 
-fn take(gpu: &Gpu, bytes: &[u8], view: &View, channels: u32, at: &Place) -> Result<Outcome, GpuError> {
+fn take(gpu: &Gpu, bytes: &[u8], view: &View, plan: &Plan, at: &Place) -> Result<Outcome, GpuError> {
     let (width, height) = (view.intrinsics.width, view.intrinsics.height);
     let pixels = (width * height) as u64;
     let totals = words::<u32>(gpu, bytes, at.totals..at.planes)?;
     let [visible, _drawn, pairs, ..] = totals.as_slice() else { return Err(gpu.failed("counts are missing")) };
     let middle = at.planes + 4 * pixels;
-    let feature_bytes = 4 * pixels * u64::from(channels);
     let picture = Picture {
         width,
         height,
-        feature_count: channels as usize,
-        features: words(gpu, bytes, at.features..at.features + feature_bytes)?,
+        feature_count: plan.channels() as usize,
+        features: features(gpu, bytes, plan, at.features, pixels)?,
         alpha: words(gpu, bytes, at.planes..middle)?,
         depth: words(gpu, bytes, middle..at.features)?,
     };
     Ok(Outcome { visible: *visible, pairs: *pairs, picture })
+}
+
+/// A picture's features; the buffers they were in, one after the other, become rows of all channels.
+fn features(gpu: &Gpu, bytes: &[u8], plan: &Plan, start: u64, pixels: u64) -> Result<Vec<f32>, GpuError> {
+    let channels = plan.channels() as usize;
+    let all: Vec<f32> = words(gpu, bytes, start..start + 4 * pixels * channels as u64)?;
+    if plan.outs.len() < 2 {
+        return Ok(all);
+    }
+    let mut rows = vec![0.0; all.len()];
+    let (mut rest, mut first) = (all.as_slice(), 0);
+    for &width in &plan.outs {
+        let width = width as usize;
+        let (part, after) = rest.split_at(width * pixels as usize);
+        for (row, values) in rows.chunks_exact_mut(channels).zip(part.chunks_exact(width)) {
+            row[first..first + width].copy_from_slice(values);
+        }
+        (rest, first) = (after, first + width);
+    }
+    Ok(rows)
 }
 
 /// A part of the mapped bytes as numbers.

@@ -19,6 +19,7 @@ macro_rules! shaders {
 
 shaders! {
     CHECK = "check.wgsl";
+    MOTION = "motion.wgsl";
     PROJECT = "project.wgsl";
     SCAN = "scan.wgsl";
     SORT = "sort.wgsl";

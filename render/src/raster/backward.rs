@@ -5,8 +5,8 @@
 //! one writer, so the result is the same for any number of threads.
 
 use super::project::Camera;
-use super::tile::TileInput;
-use super::tiles::{TILE_H, TILE_W};
+use super::tile::{FeatureRows, TileInput};
+use super::tiles::{ChunkView, TILE_H, TILE_W};
 use super::unblend::{MOMENTS, UnblendScratch, UpstreamRow, unblend_tile};
 use super::unproject::{ChunkGradients, UnprojectInput, unproject_chunk};
 use super::{ALPHA_FLOOR, CpuRasterizer, Picture, RasterError, Rendered, Splats};
@@ -78,12 +78,13 @@ impl CpuRasterizer {
         gradients: &mut SplatGradients,
     ) -> Result<(), RasterError> {
         splats.validate()?;
-        let Self { settings, isa, chunks, tiles, rendered, stats } = self;
+        let Self { settings, isa, chunks, tiles, rendered, .. } = self;
         let rendered = rendered.as_ref().ok_or(RasterError::NotRendered { what: "nothing" })?;
         check_request(rendered, splats, views)?;
         check_upstream(views, splats.feature_count, pictures, upstream)?;
         let row_len = MOMENTS + splats.feature_count;
-        let pair_sums = stats.pairs.saturating_mul(row_len);
+        let pairs: usize = chunks.iter().flat_map(|chunk| &chunk.views).map(ChunkView::box_tiles).sum();
+        let pair_sums = pairs.saturating_mul(row_len);
         if pair_sums > MAX_PAIR_SUMS {
             return Err(RasterError::TooMany { name: "sums of pairs", value: pair_sums, limit: MAX_PAIR_SUMS });
         }
@@ -112,8 +113,7 @@ impl CpuRasterizer {
                 chunks,
                 chunk_bits: rendered.chunk_bits,
                 view,
-                features: splats.features,
-                feature_count: splats.feature_count,
+                features: FeatureRows::all(splats.features, splats.feature_count),
                 alpha_cap,
             };
             scratch.reset(&input, &memory.end);

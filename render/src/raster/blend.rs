@@ -2,10 +2,9 @@
 //! every channel is one multiply-add per row, so that more channels cost little.
 
 use super::settings::{ALPHA_FLOOR, ALPHA_MIN, TRANSMITTANCE_STOP};
-use super::simd::{dispatch, exp2_neg_lanes, fma, prefetch};
+use super::simd::{dispatch, exp2_neg_lanes, fma};
 use super::tile::{
-    BATCH, Cut, EDGE, Finished, LINE_FLOATS, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, low_bits, mask,
-    prefetch_records,
+    BATCH, Cut, EDGE, Finished, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, low_bits, mask, prefetch_records,
 };
 use super::tiles::{TILE_H, TILE_W};
 
@@ -33,6 +32,9 @@ pub(crate) struct Scratch {
     batch: Vec<Cut>,
     fetched: Vec<Cut>,
     finished: Vec<Finished>,
+    /// Splats blended so far, and the runs of eight pixels that took.
+    pub(crate) blended: usize,
+    pub(crate) sweeps: usize,
     /// For sorting.
     pub(crate) spare_keys: Vec<u64>,
 }
@@ -46,6 +48,8 @@ impl Scratch {
             batch: Vec::with_capacity(BATCH),
             fetched: Vec::with_capacity(BATCH),
             finished: Vec::new(),
+            blended: 0,
+            sweeps: 0,
             spare_keys: Vec::new(),
         }
     }
@@ -54,6 +58,7 @@ impl Scratch {
         self.sums.clear();
         self.sums.resize(TILE_H * planes, [0.0; PITCH]);
         self.finished.clear();
+        (self.blended, self.sweeps) = (0, 0);
         for y in 0..TILE_H {
             let row_width = if y < height { width.min(TILE_W) } else { 0 };
             self.live[y] = low_bits(row_width);
@@ -94,7 +99,7 @@ dispatch!(
 
 #[inline(always)]
 fn blend_tile_kernel<const FMA: bool>(input: &TileInput, scratch: &mut Scratch) {
-    scratch.reset(input.width, input.height, BASE_PLANES + input.feature_count);
+    scratch.reset(input.width, input.height, BASE_PLANES + input.features.count);
     let batch = |index: usize| {
         let keys = input.keys.get(index * BATCH..).unwrap_or_default();
         keys.get(..BATCH).unwrap_or(keys)
@@ -107,9 +112,11 @@ fn blend_tile_kernel<const FMA: bool>(input: &TileInput, scratch: &mut Scratch) 
         std::mem::swap(&mut scratch.batch, &mut scratch.fetched);
         prefetch_records(input, batch(index + 2));
         fetch(input, (index + 1) * BATCH, batch(index + 1), scratch);
-        let Scratch { transmittance, sums, live, finished, batch, .. } = &mut *scratch;
+        let Scratch { transmittance, sums, live, finished, batch, blended, sweeps, .. } = &mut *scratch;
         for cut in batch.iter() {
             if is_live(live, cut) {
+                *blended += 1;
+                *sweeps += (cut.x1 - cut.x0).div_ceil(WIDTH) * (cut.y1 - cut.y0);
                 blend_splat::<FMA>(input, cut, transmittance, sums, live, finished);
             }
         }
@@ -126,10 +133,7 @@ fn fetch(input: &TileInput, first: usize, keys: &[u64], scratch: &mut Scratch) {
     for (offset, &key) in keys.iter().enumerate() {
         let cut = Cut::new(input, first + offset, key);
         if is_live(&scratch.live, &cut) {
-            let first = cut.id as usize * input.feature_count;
-            for at in (first..first + input.feature_count).step_by(LINE_FLOATS) {
-                prefetch(input.features, at);
-            }
+            input.features.prefetch(cut.id);
             scratch.fetched.push(cut);
         }
     }
@@ -146,7 +150,7 @@ fn blend_splat<const FMA: bool>(
     done: &mut Vec<Finished>,
 ) {
     let record = &cut.record;
-    let features = &input.features[cut.id as usize * input.feature_count..][..input.feature_count];
+    let features = input.features.of(cut.id);
     let planes = BASE_PLANES + features.len();
     // The tile's corner seen from the centre; the whole numbers are exact, so small boxes keep all digits.
     let left = (input.x0 as f32 - f32::from(record.x0)) + 0.5;

@@ -49,4 +49,17 @@ pub enum RasterError {
         /// What it drew instead.
         what: &'static str,
     },
+    /// Loaded Gaussians that are gone, or another renderer's.
+    #[error("these Gaussians are not loaded here (any more): a `load` is good until the next `load` or `render`")]
+    NotLoaded,
+    /// Channels that the loaded Gaussians do not have.
+    #[error("channels {start}..{end} of Gaussians with {feature_count}; name a range inside")]
+    Channels {
+        /// First channel.
+        start: usize,
+        /// One past the last.
+        end: usize,
+        /// What there is.
+        feature_count: usize,
+    },
 }

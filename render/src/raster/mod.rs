@@ -1,6 +1,6 @@
 //! Splatting: rasterisation of 3D Gaussians on the CPU and its gradients, by the rules of gsplat (see [`Convention`]).
 //!
-//! The data's way: `scene` (checked input) -> `project` (ellipses of eight Gaussians at a time, for all views) ->
+//! The data's way: `scene` (checked input) or `loaded` (kept between pictures) -> `project` (ellipses of eight Gaussians at a time, for all views) ->
 //! `tiles` (each chunk lists its splats by tile) -> `sort` (depth order per tile) -> `blend` (front to back) ->
 //! [`Picture`]; and back: [`PictureGradient`] -> `unblend` (back to front) -> `unproject` -> [`SplatGradients`], from
 //! there to velocities by [`VelocityGradients`]. [`reference`](mod@reference) is the slow, obvious version all of it is tested against.
@@ -8,6 +8,7 @@
 mod backward;
 mod blend;
 mod error;
+mod loaded;
 mod motion;
 mod project;
 pub mod reference;
@@ -25,19 +26,24 @@ mod tests;
 
 pub use backward::{MAX_PAIR_SUMS, PictureGradient, SplatGradients};
 pub use error::RasterError;
-pub use motion::VelocityGradients;
-pub use scene::{MAX_FEATURES, MAX_PICTURE_VALUES, MAX_SIDE, MAX_SPLATS, MAX_VIEWS, Picture, RasterStats, Splats};
+pub(crate) use loaded::validate_time;
+pub use loaded::{Channels, Loaded};
+pub use motion::{Motion, VelocityGradients};
+pub use scene::{
+    MAX_FEATURES, MAX_PICTURE_VALUES, MAX_SIDE, MAX_SPLATS, MAX_VIEWS, Picture, RasterStats, RasterWork, Splats,
+};
 use settings::ALPHA_FLOOR;
 pub use settings::{ALPHA_MIN, Convention, RasterSettings, TILE_RULE, TRANSMITTANCE_STOP};
 
 use crate::camera::View;
 use blend::{RowOut, Scratch, blend_tile};
+use loaded::Stored;
 use project::{Block, Camera, Footprints, LANES, Rules};
 use rayon::prelude::*;
 use simd::Isa;
 use std::sync::atomic::AtomicUsize;
-use tile::{TileEnd, TileInput};
-use tiles::{Chunk, ChunkInput, Grid, TILE_H, TILE_W, fill_chunk};
+use tile::{FeatureRows, TileEnd, TileInput};
+use tiles::{Chunk, ChunkCounts, ChunkInput, Grid, Source, TILE_H, TILE_W, fill_chunk};
 
 /// Most entries of all tile lists together (2 GiB of keys).
 pub const MAX_PAIRS: usize = 1 << 28;
@@ -55,7 +61,11 @@ pub struct CpuRasterizer {
     tiles: Vec<TileMemory>,
     /// What the last successful `render` drew.
     rendered: Option<Rendered>,
+    /// The Gaussians of `load` and their name while they may be drawn.
+    stored: Stored,
+    loaded: Option<Loaded>,
     stats: RasterStats,
+    work: RasterWork,
 }
 
 /// What is kept of a tile.
@@ -64,6 +74,9 @@ struct TileMemory {
     /// Sorted list.
     keys: Vec<u64>,
     end: TileEnd,
+    /// Splats that met an unfinished pixel, and the runs of eight pixels shaded for them.
+    blended: usize,
+    sweeps: usize,
 }
 
 /// The request that the kept lists belong to.
@@ -92,7 +105,17 @@ impl CpuRasterizer {
     pub fn new(settings: RasterSettings) -> Result<Self, RasterError> {
         settings.validate()?;
         let isa = Isa::detect();
-        Ok(Self { settings, isa, chunks: Vec::new(), tiles: Vec::new(), rendered: None, stats: RasterStats::default() })
+        Ok(Self {
+            settings,
+            isa,
+            chunks: Vec::new(),
+            tiles: Vec::new(),
+            rendered: None,
+            stored: Stored::default(),
+            loaded: None,
+            stats: RasterStats::default(),
+            work: RasterWork::default(),
+        })
     }
 
     /// The settings in use.
@@ -103,6 +126,11 @@ impl CpuRasterizer {
     /// Counts of the last successful `render`.
     pub fn stats(&self) -> RasterStats {
         self.stats
+    }
+
+    /// What the last successful `render` or `draw` had to do, and what it could leave.
+    pub fn work(&self) -> RasterWork {
+        self.work
     }
 
     /// Renders every view; splats with non-finite numbers are skipped and counted, everything returned is finite.
@@ -127,18 +155,91 @@ impl CpuRasterizer {
     ) -> Result<(), RasterError> {
         splats.validate()?;
         scene::validate_views(views, splats.feature_count)?;
-        self.rendered = None;
-        let grid = Grid::new(views.iter().map(|v| (v.intrinsics.width, v.intrinsics.height)));
-        let (chunk_bits, stats) = self.fill_chunks(splats, views, &grid)?;
-        self.stats = stats;
-        pictures.resize_with(views.len(), Picture::default);
-        for (picture, view) in pictures.iter_mut().zip(views) {
-            picture.resize(view.intrinsics.width, view.intrinsics.height, splats.feature_count);
-        }
-        self.blend(splats, &grid, chunk_bits, pictures);
+        self.loaded = None;
+        let features = FeatureRows::all(splats.features, splats.feature_count);
+        let chunk_bits = self.rasterize(Source::Fresh(*splats), features, views, pictures)?;
         let (n, feature_count) = (splats.len(), splats.feature_count);
         self.rendered = Some(Rendered { views: views.to_vec(), splats: n, feature_count, chunk_bits });
         Ok(())
+    }
+
+    /// Keeps Gaussians, with how they move when they do, for [`draw`](Self::draw): their 3D covariances are worked out
+    /// here, once for all times and views, and so are the bounds that let a view pass over what it cannot see.
+    ///
+    /// The name is good until the next `load` or `render`.
+    ///
+    /// # Errors
+    /// Arrays that do not fit together.
+    pub fn load(&mut self, splats: &Splats, motion: Option<&Motion>) -> Result<Loaded, RasterError> {
+        splats.validate()?;
+        motion.map_or(Ok(()), |motion| motion.validate(splats.len()))?;
+        self.stored.fill(splats, motion);
+        let name = Loaded::new();
+        self.loaded = Some(name);
+        Ok(name)
+    }
+
+    /// Renders loaded Gaussians where they are at `time_sec` (paper eq. 1; any time for those that do not move): the very
+    /// pictures that [`render`](Self::render) takes of the moved means and the channels named. No backward pass follows.
+    ///
+    /// # Errors
+    /// Gaussians that are not loaded any more, channels they do not have, a time that is not finite, or as `render`.
+    pub fn draw(
+        &mut self,
+        loaded: Loaded,
+        time_sec: f32,
+        channels: &Channels,
+        views: &[View],
+    ) -> Result<Vec<Picture>, RasterError> {
+        let mut pictures = Vec::new();
+        self.draw_into(loaded, time_sec, channels, views, &mut pictures)?;
+        Ok(pictures)
+    }
+
+    /// [`draw`](Self::draw) into pictures whose memory is reused; on error they are left as they were.
+    ///
+    /// # Errors
+    /// As `draw`.
+    pub fn draw_into(
+        &mut self,
+        loaded: Loaded,
+        time_sec: f32,
+        channels: &Channels,
+        views: &[View],
+        pictures: &mut Vec<Picture>,
+    ) -> Result<(), RasterError> {
+        if self.loaded != Some(loaded) {
+            return Err(RasterError::NotLoaded);
+        }
+        channels.validate(self.stored.feature_count())?;
+        validate_time(time_sec)?;
+        scene::validate_views(views, channels.0.len())?;
+        let stored = std::mem::take(&mut self.stored);
+        let done = self.rasterize(Source::Kept(&stored, time_sec), stored.features(channels), views, pictures);
+        self.stored = stored;
+        done.map(|_| ())
+    }
+
+    /// Renders validated views; returns the chunk size.
+    fn rasterize(
+        &mut self,
+        source: Source,
+        features: FeatureRows,
+        views: &[View],
+        pictures: &mut Vec<Picture>,
+    ) -> Result<u32, RasterError> {
+        self.rendered = None;
+        let grid = Grid::new(views.iter().map(|v| (v.intrinsics.width, v.intrinsics.height)));
+        let (chunk_bits, stats, mut work) = self.fill_chunks(source, views, &grid)?;
+        pictures.resize_with(views.len(), Picture::default);
+        for (picture, view) in pictures.iter_mut().zip(views) {
+            picture.resize(view.intrinsics.width, view.intrinsics.height, features.count);
+        }
+        self.blend(features, &grid, chunk_bits, pictures);
+        work.blended = self.tiles.iter().map(|tile| tile.blended).sum();
+        work.sweeps = self.tiles.iter().map(|tile| tile.sweeps).sum();
+        (self.stats, self.work) = (stats, work);
+        Ok(chunk_bits)
     }
 
     /// Where each Gaussian lands in a view: `None` where it is invalid or culled.
@@ -154,7 +255,7 @@ impl CpuRasterizer {
         let mut out = vec![None; splats.len()];
         for (index, slots) in out.chunks_mut(LANES).enumerate() {
             block.load(splats, index * LANES, slots.len(), false);
-            if !project::project::<{ simd::TARGET_FMA }>(&block, &camera, &rules, &mut prints) {
+            if !project::project::<{ simd::TARGET_FMA }>(&block.centers, &block.shapes, &camera, &rules, &mut prints) {
                 continue;
             }
             for (l, slot) in slots.iter_mut().enumerate() {
@@ -165,14 +266,19 @@ impl CpuRasterizer {
     }
 
     /// Projects and bins all Gaussians; returns the chunk size and the counts.
-    fn fill_chunks(&mut self, splats: &Splats, views: &[View], grid: &Grid) -> Result<(u32, RasterStats), RasterError> {
-        let n = splats.len();
+    fn fill_chunks(
+        &mut self,
+        source: Source,
+        views: &[View],
+        grid: &Grid,
+    ) -> Result<(u32, RasterStats, RasterWork), RasterError> {
+        let n = source.len();
         let chunk_bits = n.div_ceil(MAX_CHUNKS).next_power_of_two().ilog2().max(MIN_CHUNK_BITS);
         let chunk_len = 1usize << chunk_bits;
         let cameras: Vec<Camera> = views.iter().map(|v| Camera::new(v, self.settings.convention)).collect();
         let pairs = AtomicUsize::new(0);
         let rules = Rules::from(&self.settings);
-        let input = ChunkInput { splats: *splats, cameras: &cameras, rules, grid, pairs: &pairs };
+        let input = ChunkInput { source, cameras: &cameras, rules, grid, pairs: &pairs };
         let isa = self.isa;
         self.chunks.resize_with(n.div_ceil(chunk_len), Chunk::default);
         self.chunks.par_iter_mut().enumerate().for_each(|(index, chunk)| {
@@ -183,14 +289,21 @@ impl CpuRasterizer {
         if pairs > MAX_PAIRS {
             return Err(RasterError::TooMany { name: "tile list entries", value: pairs, limit: MAX_PAIRS });
         }
-        let invalid = self.chunks.iter().map(|c| c.invalid).sum();
-        let visible = self.chunks.iter().map(|c| c.visible).sum();
+        let sum = |count: fn(&ChunkCounts) -> usize| self.chunks.iter().map(|c| count(&c.counts)).sum::<usize>();
+        let never = if let Source::Kept(stored, _) = source { stored.invalid() } else { 0 };
+        let (invalid, visible) = (never + sum(|c| c.invalid), sum(|c| c.visible));
         let culled = (n - invalid) * views.len() - visible;
-        Ok((chunk_bits, RasterStats { splats: n, invalid, culled, visible, pairs }))
+        let work = RasterWork {
+            shapes: sum(|c| c.shapes),
+            unread: sum(|c| c.unread),
+            listed: sum(|c| c.listed),
+            ..RasterWork::default()
+        };
+        Ok((chunk_bits, RasterStats { splats: n, invalid, culled, visible, pairs }, work))
     }
 
     /// Sorts and blends every tile.
-    fn blend(&mut self, splats: &Splats, grid: &Grid, chunk_bits: u32, pictures: &mut [Picture]) {
+    fn blend(&mut self, features: FeatureRows, grid: &Grid, chunk_bits: u32, pictures: &mut [Picture]) {
         self.tiles.resize_with(grid.tile_count(), TileMemory::default);
         let mut jobs: Vec<TileJob> = Vec::with_capacity(grid.tile_count());
         for (view, picture) in pictures.iter_mut().enumerate() {
@@ -216,13 +329,13 @@ impl CpuRasterizer {
                     chunks,
                     chunk_bits,
                     view: job.view,
-                    features: splats.features,
-                    feature_count: splats.feature_count,
+                    features,
                     alpha_cap,
                 };
                 blend_tile(isa, &input, scratch);
                 scratch.keep(&mut memory.end);
-                scratch.write(&mut job.rows, splats.feature_count);
+                (memory.blended, memory.sweeps) = (scratch.blended, scratch.sweeps);
+                scratch.write(&mut job.rows, features.count);
             },
         );
     }

@@ -1,7 +1,49 @@
-//! Gradients of velocities: a Gaussian drawn at time `t'` stands at `mean + (t' - t) v` (paper eq. 1), so a velocity
-//! receives `t' - t` times what the moved mean receives.
+//! Motion (paper eq. 1): a Gaussian seen at `t` and drawn at `t'` stands at `mean + (t' - t) v`, with its backward velocity
+//! for earlier and its forward velocity for later times. So a velocity receives `t' - t` times the moved mean's gradient.
 
 use super::RasterError;
+
+/// How Gaussians move; one row for each.
+#[derive(Debug, Clone, Copy)]
+pub struct Motion<'a> {
+    /// Velocity before `time_sec`, m/s.
+    pub velocity_backward: &'a [[f32; 3]],
+    /// Velocity after `time_sec`, m/s.
+    pub velocity_forward: &'a [[f32; 3]],
+    /// When each Gaussian stood at its mean, seconds.
+    pub time_sec: &'a [f32],
+}
+
+impl Motion<'_> {
+    /// Checks that there is a row for each of `splats` Gaussians.
+    ///
+    /// # Errors
+    /// The array that differs.
+    pub fn validate(&self, splats: usize) -> Result<(), RasterError> {
+        let lengths = [
+            ("velocity_backward", self.velocity_backward.len()),
+            ("velocity_forward", self.velocity_forward.len()),
+            ("time_sec", self.time_sec.len()),
+        ];
+        match lengths.into_iter().find(|&(_, len)| len != splats) {
+            Some((name, len)) => Err(RasterError::Length { name, len, expected: splats, splats }),
+            None => Ok(()),
+        }
+    }
+
+    /// Where Gaussian `i`, seen at `mean`, stands at `draw_sec`.
+    #[inline(always)]
+    pub(crate) fn place(&self, i: usize, mean: &[f32; 3], draw_sec: f32) -> [f32; 3] {
+        moved(mean, &self.velocity_backward[i], &self.velocity_forward[i], draw_sec - self.time_sec[i])
+    }
+}
+
+/// A mean `dt` seconds after it was seen.
+#[inline(always)]
+fn moved(mean: &[f32; 3], backward: &[f32; 3], forward: &[f32; 3], dt: f32) -> [f32; 3] {
+    let v = if dt < 0.0 { backward } else { forward };
+    [mean[0] + dt * v[0], mean[1] + dt * v[1], mean[2] + dt * v[2]]
+}
 
 /// Gradient of a loss with respect to the velocities of [`Gaussians`](crate::Gaussians), per m/s; sums over the times
 /// drawn. A model with one velocity for both directions takes `backward + forward`.

@@ -8,7 +8,7 @@ use super::Splats;
 use super::settings::{
     ALPHA_MIN, Convention, DISCRIMINANT_FLOOR, LATEST_EXTENT, OPACITY_CEILING, RasterSettings, TILE_RULE,
 };
-use super::simd::fma64;
+use super::simd::{fma64, ln_lanes};
 use crate::camera::View;
 
 /// Gaussians projected together.
@@ -86,34 +86,54 @@ impl From<&RasterSettings> for Rules {
     }
 }
 
+/// Where eight Gaussians stand.
+#[derive(Debug, Clone)]
+pub(crate) struct Centers {
+    pub(crate) mean: [Lane; 3],
+    /// False for lanes past the end and for Gaussians with a non-finite number or a zero quaternion.
+    pub(crate) usable: [bool; LANES],
+}
+
+/// What eight Gaussians look like, wherever they stand and whoever looks: motion moves centres only, so this is the
+/// same at all times.
+#[derive(Debug, Clone)]
+pub(crate) struct Shapes {
+    /// `R S`, row-major; the 3D covariance is `R S (R S)^T`.
+    pub(crate) axes: [[Lane; 3]; 3],
+    /// Largest squared scale.
+    pub(crate) size2: Lane,
+    /// `2 ln(255 o)`: squared standard deviations at which alpha falls to 1/255; negative when it never reaches it.
+    pub(crate) reach2: Lane,
+}
+
 /// Eight Gaussians, independent of any view.
 #[derive(Debug, Clone)]
 pub(crate) struct Block {
-    pub(crate) mean: [Lane; 3],
-    /// `R S`, row-major.
-    pub(crate) axes: [[Lane; 3]; 3],
-    /// Largest squared scale.
-    size2: Lane,
-    /// `2 ln(255 o)`: squared standard deviations at which alpha falls to 1/255; negative when it never reaches it.
-    pub(crate) reach2: Lane,
-    /// False for lanes past the end and for Gaussians with a non-finite number or a zero quaternion.
-    pub(crate) usable: [bool; LANES],
+    pub(crate) centers: Centers,
+    pub(crate) shapes: Shapes,
+}
+
+impl Centers {
+    pub(crate) fn new() -> Self {
+        Self { mean: [[0.0; LANES]; 3], usable: [false; LANES] }
+    }
 }
 
 impl Block {
     pub(crate) fn new() -> Self {
         let zero = [0.0; LANES];
-        Self { mean: [zero; 3], axes: [[zero; 3]; 3], size2: zero, reach2: zero, usable: [false; LANES] }
+        Self { centers: Centers::new(), shapes: Shapes { axes: [[zero; 3]; 3], size2: zero, reach2: zero } }
     }
 
     /// Reads `count` Gaussians from `start` on; returns how many of them are invalid.
     /// `features_finite` says that the caller has looked at the features already.
     #[inline(always)]
     pub(crate) fn load(&mut self, splats: &Splats, start: usize, count: usize, features_finite: bool) -> usize {
+        let Self { centers, shapes } = self;
         let zero = [0.0; LANES];
-        let (mut quat, mut scale) = ([zero; 4], [zero; 3]);
+        let (mut quat, mut scale, mut reach) = ([zero; 4], [zero; 3], zero);
         let mut invalid = 0;
-        self.usable = [false; LANES];
+        centers.usable = [false; LANES];
         for l in 0..count.min(LANES) {
             let i = start + l;
             let (m, q, s, o) = (&splats.means[i], &splats.quats[i], &splats.scales[i], splats.opacities[i]);
@@ -123,21 +143,37 @@ impl Block {
             let orientation = q[0] != 0.0 || q[1] != 0.0 || q[2] != 0.0 || q[3] != 0.0;
             // Sums of huge numbers may overflow where each is finite: those take the careful look too.
             let usable = (zeros == 0.0 && orientation && features_finite) || splats.is_usable(i);
-            self.usable[l] = usable;
+            centers.usable[l] = usable;
             invalid += usize::from(!usable);
             for axis in 0..3 {
-                self.mean[axis][l] = if usable { f64::from(m[axis]) } else { 0.0 };
+                centers.mean[axis][l] = if usable { f64::from(m[axis]) } else { 0.0 };
                 scale[axis][l] = if usable { f64::from(s[axis]) } else { 0.0 };
             }
             for axis in 0..4 {
                 quat[axis][l] = if usable { f64::from(q[axis]) } else { 1.0 };
             }
             let o = o.min(OPACITY_CEILING);
-            self.reach2[l] = if usable && o >= ALPHA_MIN { 2.0 * f64::from(o / ALPHA_MIN).ln() } else { -1.0 };
+            reach[l] = if usable && o >= ALPHA_MIN { f64::from(o / ALPHA_MIN) } else { 0.0 };
         }
         for l in count..LANES {
             quat[0][l] = 1.0;
-            self.reach2[l] = -1.0;
+        }
+        shapes.set(&quat, &scale, &reach);
+        invalid
+    }
+}
+
+impl Shapes {
+    /// From quaternions, scales and `255 o` (0 for what is too faint to show).
+    #[inline(always)]
+    fn set(&mut self, quat: &[Lane; 4], scale: &[Lane; 3], reach: &Lane) {
+        let mut ln = [1.0; LANES];
+        for l in 0..LANES {
+            ln[l] = reach[l].max(1.0);
+        }
+        ln_lanes(&mut ln);
+        for l in 0..LANES {
+            self.reach2[l] = if reach[l] >= 1.0 { 2.0 * ln[l] } else { -1.0 };
         }
         for l in 0..LANES {
             let (w, x, y, z) = (quat[0][l], quat[1][l], quat[2][l], quat[3][l]);
@@ -157,7 +193,6 @@ impl Block {
             self.axes[2][2][l] = (1.0 - (xx + yy)) * s2;
             self.size2[l] = (s0 * s0).max(s1 * s1).max(s2 * s2);
         }
-        invalid
     }
 }
 
@@ -218,20 +253,69 @@ impl Footprints {
     }
 }
 
+/// No rectangle of either convention is larger than this, pixels, for Gaussians with this largest squared scale and at
+/// least this far away.
+#[inline(always)]
+fn radius_bound(size2: f64, camera: &Camera, rules: &Rules, inverse_z: f64) -> f64 {
+    let variance = size2 * camera.jacobian_bound * inverse_z * inverse_z + rules.blur;
+    LATEST_EXTENT * REJECT_SLACK * (REJECT_SLACK * variance + DISCRIMINANT_FLOOR.sqrt()).sqrt() + 1.0
+}
+
+/// A box of centres, with the largest squared scale of what stands in it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Bounds {
+    pub(crate) center: [f64; 3],
+    pub(crate) half: [f64; 3],
+    pub(crate) size2: f64,
+}
+
+impl Bounds {
+    /// False only when nothing inside can be in the picture; numbers that are not finite are never sure of that.
+    pub(crate) fn may_show(&self, camera: &Camera, rules: &Rules) -> bool {
+        let (r, t) = (&camera.rotation, &camera.translation);
+        let (c, h) = (&self.center, &self.half);
+        let span = |row: usize| {
+            let middle = r[row][0] * c[0] + r[row][1] * c[1] + r[row][2] * c[2] + t[row];
+            let half = REJECT_SLACK * (r[row][0].abs() * h[0] + r[row][1].abs() * h[1] + r[row][2].abs() * h[2]);
+            (middle - half, middle + half)
+        };
+        let (nearest, farthest) = span(2);
+        if farthest < rules.near || nearest > rules.far {
+            return false;
+        }
+        let (nearest, farthest) = (nearest.max(rules.near), farthest.min(rules.far));
+        let radius = radius_bound(self.size2, camera, rules, 1.0 / nearest);
+        for axis in 0..2 {
+            let (low, high) = span(axis);
+            let first = camera.focal[axis] * (low / nearest).min(low / farthest) + camera.center[axis];
+            let last = camera.focal[axis] * (high / nearest).max(high / farthest) + camera.center[axis];
+            if last + radius < 0.0 || first - radius > camera.size[axis] {
+                return false;
+            }
+        }
+        true
+    }
+}
+
 /// Camera-space position of the block's lanes and whether any of them can be in the picture.
 #[inline(always)]
-fn place<const FMA: bool>(block: &Block, camera: &Camera, rules: &Rules, position: &mut [Lane; 3]) -> bool {
+fn place<const FMA: bool>(
+    centers: &Centers,
+    shapes: &Shapes,
+    camera: &Camera,
+    rules: &Rules,
+    position: &mut [Lane; 3],
+) -> bool {
     let (r, t) = (&camera.rotation, &camera.translation);
     let mut any = [0u64; LANES];
     for l in 0..LANES {
-        let (mx, my, mz) = (block.mean[0][l], block.mean[1][l], block.mean[2][l]);
+        let (mx, my, mz) = (centers.mean[0][l], centers.mean[1][l], centers.mean[2][l]);
         let dot =
             |row: &[f64; 3], t: f64| fma64::<FMA>(row[0], mx, fma64::<FMA>(row[1], my, fma64::<FMA>(row[2], mz, t)));
         let (x, y, z) = (dot(&r[0], t[0]), dot(&r[1], t[1]), dot(&r[2], t[2]));
         (position[0][l], position[1][l], position[2][l]) = (x, y, z);
         let inverse_z = 1.0 / z;
-        let variance = block.size2[l] * camera.jacobian_bound * inverse_z * inverse_z + rules.blur;
-        let radius = LATEST_EXTENT * REJECT_SLACK * (REJECT_SLACK * variance + DISCRIMINANT_FLOOR.sqrt()).sqrt() + 1.0;
+        let radius = radius_bound(shapes.size2[l], camera, rules, inverse_z);
         let u = camera.focal[0] * x * inverse_z + camera.center[0];
         let v = camera.focal[1] * y * inverse_z + camera.center[1];
         let near_enough = (z >= rules.near) & (z <= rules.far);
@@ -242,26 +326,32 @@ fn place<const FMA: bool>(block: &Block, camera: &Camera, rules: &Rules, positio
     any.iter().fold(0, |a, b| a | b) != 0
 }
 
-/// Projects a block into a view; false (and `out` untouched) when nothing of it can be in the picture.
+/// Projects eight Gaussians into a view; false (and `out` untouched) when none of them can be in the picture.
 #[inline(always)]
-pub(crate) fn project<const FMA: bool>(block: &Block, camera: &Camera, rules: &Rules, out: &mut Footprints) -> bool {
+pub(crate) fn project<const FMA: bool>(
+    centers: &Centers,
+    shapes: &Shapes,
+    camera: &Camera,
+    rules: &Rules,
+    out: &mut Footprints,
+) -> bool {
     let mut position = [[0.0; LANES]; 3];
-    if !place::<FMA>(block, camera, rules, &mut position) {
+    if !place::<FMA>(centers, shapes, camera, rules, &mut position) {
         return false;
     }
-    covariance::<FMA>(block, camera, rules, &position, out);
+    covariance::<FMA>(shapes, camera, rules, &position, out);
     match rules.convention {
         Convention::Pinned => square_radius(out),
-        Convention::Latest => rectangle_radius(block, out),
+        Convention::Latest => rectangle_radius(shapes, out),
     }
-    boxes(block, camera, rules, out);
+    boxes(centers, shapes, camera, rules, out);
     true
 }
 
 /// Picture position and 2D covariance.
 #[inline(always)]
 fn covariance<const FMA: bool>(
-    block: &Block,
+    shapes: &Shapes,
     camera: &Camera,
     rules: &Rules,
     position: &[Lane; 3],
@@ -280,7 +370,7 @@ fn covariance<const FMA: bool>(
         let p0: [f64; 3] = std::array::from_fn(|k| jx * fma64::<FMA>(-tangent_x, r[2][k], r[0][k]));
         let p1: [f64; 3] = std::array::from_fn(|k| jy * fma64::<FMA>(-tangent_y, r[2][k], r[1][k]));
         for k in 0..3 {
-            let (m0, m1, m2) = (block.axes[0][k][l], block.axes[1][k][l], block.axes[2][k][l]);
+            let (m0, m1, m2) = (shapes.axes[0][k][l], shapes.axes[1][k][l], shapes.axes[2][k][l]);
             g0[k] = fma64::<FMA>(p0[0], m0, fma64::<FMA>(p0[1], m1, p0[2] * m2));
             g1[k] = fma64::<FMA>(p1[0], m0, fma64::<FMA>(p1[1], m1, p1[2] * m2));
         }
@@ -320,9 +410,9 @@ fn square_radius(out: &mut Footprints) {
 
 /// Latest: per axis, as far as this opacity reaches 1/255, at most 3.33 standard deviations.
 #[inline(always)]
-fn rectangle_radius(block: &Block, out: &mut Footprints) {
+fn rectangle_radius(shapes: &Shapes, out: &mut Footprints) {
     for l in 0..LANES {
-        let extent = block.reach2[l].max(0.0).sqrt().min(LATEST_EXTENT);
+        let extent = shapes.reach2[l].max(0.0).sqrt().min(LATEST_EXTENT);
         let largest = extent * larger_eigenvalue(out.a[l], out.c[l], out.det[l]).sqrt();
         out.radius_x[l] = (extent * out.a[l].sqrt()).min(largest).ceil();
         out.radius_y[l] = (extent * out.c[l].sqrt()).min(largest).ceil();
@@ -331,11 +421,11 @@ fn rectangle_radius(block: &Block, out: &mut Footprints) {
 
 /// Culling, and the pixels to look at: the tiles of the rule, the picture, and the box of `alpha >= 1/255`.
 #[inline(always)]
-fn boxes(block: &Block, camera: &Camera, rules: &Rules, out: &mut Footprints) {
+fn boxes(centers: &Centers, shapes: &Shapes, camera: &Camera, rules: &Rules, out: &mut Footprints) {
     let [width, height] = camera.size;
     for l in 0..LANES {
-        (out.x0[l], out.x1[l]) = pixel_span(out.u[l], out.radius_x[l], block.reach2[l] * out.a[l], width);
-        (out.y0[l], out.y1[l]) = pixel_span(out.v[l], out.radius_y[l], block.reach2[l] * out.c[l], height);
+        (out.x0[l], out.x1[l]) = pixel_span(out.u[l], out.radius_x[l], shapes.reach2[l] * out.a[l], width);
+        (out.y0[l], out.y1[l]) = pixel_span(out.v[l], out.radius_y[l], shapes.reach2[l] * out.c[l], height);
     }
     for l in 0..LANES {
         let (u, v, rx, ry) = (out.u[l], out.v[l], out.radius_x[l], out.radius_y[l]);
@@ -343,12 +433,12 @@ fn boxes(block: &Block, camera: &Camera, rules: &Rules, out: &mut Footprints) {
         let solid = out.det[l] > 0.0 && out.det[l] < f64::MAX;
         let large = match rules.convention {
             Convention::Pinned => rx > rules.radius_clip,
-            Convention::Latest => (rx > rules.radius_clip || ry > rules.radius_clip) && block.reach2[l] >= 0.0,
+            Convention::Latest => (rx > rules.radius_clip || ry > rules.radius_clip) && shapes.reach2[l] >= 0.0,
         };
         let inside = u + rx > 0.0 && u - rx < width && v + ry > 0.0 && v - ry < height;
         let (k, e, f) = out.quadratic(l);
         let representable = k.is_finite() && e.is_finite() && f.is_finite();
-        out.visible[l] = block.usable[l] && ahead && solid && large && inside && representable;
+        out.visible[l] = centers.usable[l] && ahead && solid && large && inside && representable;
     }
 }
 

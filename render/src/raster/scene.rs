@@ -121,6 +121,22 @@ pub struct RasterStats {
     pub pairs: usize,
 }
 
+/// What one call had to do, and what it could leave undone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RasterWork {
+    /// 3D covariances worked out; none when loaded Gaussians are drawn.
+    pub shapes: usize,
+    /// Gaussians passed over unread, as their group is outside of the view; summed over the views.
+    pub unread: usize,
+    /// Visible Gaussians with a pixel where they may reach 1/255, so that they are listed; summed over the views. The
+    /// others are too faint, or too small and between pixel centres.
+    pub listed: usize,
+    /// Entries of tile lists that met an unfinished pixel and were blended; the rest is hidden.
+    pub blended: usize,
+    /// Runs of eight pixels shaded for these.
+    pub sweeps: usize,
+}
+
 /// Checks that every view can be rendered with `feature_count` channels.
 pub(crate) fn validate_views(views: &[View], feature_count: usize) -> Result<(), RasterError> {
     if views.len() > MAX_VIEWS {

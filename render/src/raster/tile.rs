@@ -11,7 +11,7 @@ pub(crate) const PITCH: usize = TILE_W + WIDTH;
 /// Splats fetched together, so that their cache misses overlap.
 pub(crate) const BATCH: usize = 32;
 /// Numbers in a cache line.
-pub(crate) const LINE_FLOATS: usize = 16;
+const LINE_FLOATS: usize = 16;
 
 const _: () = assert!(TILE_W == u32::BITS as usize, "a row of a tile is one u32 of live pixels");
 
@@ -29,9 +29,42 @@ pub(crate) struct TileInput<'a> {
     /// log2 of the slots of a chunk.
     pub(crate) chunk_bits: u32,
     pub(crate) view: usize,
-    pub(crate) features: &'a [f32],
-    pub(crate) feature_count: usize,
+    pub(crate) features: FeatureRows<'a>,
     pub(crate) alpha_cap: f32,
+}
+
+/// The channels to draw of every Gaussian's row of features.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FeatureRows<'a> {
+    pub(crate) values: &'a [f32],
+    /// Channels of a Gaussian.
+    pub(crate) stride: usize,
+    /// First channel drawn.
+    pub(crate) first: usize,
+    /// Channels drawn.
+    pub(crate) count: usize,
+}
+
+impl<'a> FeatureRows<'a> {
+    /// All channels.
+    pub(crate) fn all(values: &'a [f32], count: usize) -> Self {
+        Self { values, stride: count, first: 0, count }
+    }
+
+    /// The drawn channels of Gaussian `id`.
+    #[inline(always)]
+    pub(crate) fn of(&self, id: u32) -> &'a [f32] {
+        &self.values[id as usize * self.stride + self.first..][..self.count]
+    }
+
+    /// Asks for them.
+    #[inline(always)]
+    pub(crate) fn prefetch(&self, id: u32) {
+        let first = id as usize * self.stride + self.first;
+        for at in (first..first + self.count).step_by(LINE_FLOATS) {
+            prefetch(self.values, at);
+        }
+    }
 }
 
 /// A splat cut to a tile.
@@ -110,8 +143,29 @@ pub(crate) fn low_bits(count: usize) -> u32 {
 #[inline(always)]
 pub(crate) fn is_live(live: &[u32; TILE_H], cut: &Cut) -> bool {
     let columns = low_bits(cut.x1 - cut.x0) << cut.x0;
-    live[cut.y0..cut.y1].iter().fold(0, |a, b| a | b) & columns != 0
+    // All rows, whatever the box: a loop over its few rows would end where the processor did not expect it.
+    let (first, end) = (&ROWS_BELOW[cut.y0.min(TILE_H)], &ROWS_BELOW[cut.y1.min(TILE_H)]);
+    let mut any = [0u32; TILE_H];
+    for y in 0..TILE_H {
+        any[y] = live[y] & end[y] & !first[y];
+    }
+    any.iter().fold(0, |a, b| a | b) & columns != 0
 }
+
+/// All ones for the rows below the index, 0 from there on.
+const ROWS_BELOW: [[u32; TILE_H]; TILE_H + 1] = {
+    let mut table = [[0; TILE_H]; TILE_H + 1];
+    let mut rows = 0;
+    while rows <= TILE_H {
+        let mut y = 0;
+        while y < rows {
+            table[rows][y] = u32::MAX;
+            y += 1;
+        }
+        rows += 1;
+    }
+    table
+};
 
 /// The chunk and the position in it that a key stands for.
 #[inline(always)]

@@ -6,10 +6,8 @@
 //! `R += alpha (G - R)` in front of each. Nothing is subtracted from a total, so nothing cancels.
 
 use super::settings::ALPHA_MIN;
-use super::simd::{dispatch, exp2_neg_lanes, fma, prefetch};
-use super::tile::{
-    BATCH, Cut, EDGE, LINE_FLOATS, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, locate, mask, prefetch_records,
-};
+use super::simd::{dispatch, exp2_neg_lanes, fma};
+use super::tile::{BATCH, Cut, EDGE, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, locate, mask, prefetch_records};
 use super::tiles::{TILE_H, TILE_W};
 use std::sync::atomic::Ordering;
 
@@ -80,7 +78,7 @@ impl UnblendScratch {
     pub(crate) fn reset(&mut self, input: &TileInput, end: &TileEnd) {
         self.behind = [[0.0; PITCH]; TILE_H];
         self.upstream.clear();
-        self.upstream.resize(TILE_H * (BASE_PLANES + input.feature_count), [0.0; PITCH]);
+        self.upstream.resize(TILE_H * (BASE_PLANES + input.features.count), [0.0; PITCH]);
         self.transmittance = [[0.0; PITCH]; TILE_H];
         for (row, kept) in self.transmittance.iter_mut().zip(end.transmittance.chunks_exact(TILE_W)) {
             row[..TILE_W].copy_from_slice(kept);
@@ -117,7 +115,7 @@ dispatch!(
 #[inline(always)]
 fn unblend_tile_kernel<const FMA: bool>(input: &TileInput, end: &TileEnd, scratch: &mut UnblendScratch) {
     scratch.sums.clear();
-    scratch.sums.resize(MOMENTS + input.feature_count, [0.0; WIDTH]);
+    scratch.sums.resize(MOMENTS + input.features.count, [0.0; WIDTH]);
     let mut finished = end.finished.as_slice();
     // Behind the splat that finished the last pixel nothing was blended, unless some pixel never was finished.
     let count = match finished.last() {
@@ -161,10 +159,7 @@ fn fetch(input: &TileInput, (first, keys): (usize, &[u64]), fetched: &mut Vec<Cu
     fetched.clear();
     for (offset, &key) in keys.iter().enumerate() {
         let cut = Cut::new(input, first + offset, key);
-        let row = cut.id as usize * input.feature_count;
-        for at in (row..row + input.feature_count).step_by(LINE_FLOATS) {
-            prefetch(input.features, at);
-        }
+        input.features.prefetch(cut.id);
         fetched.push(cut);
     }
 }
@@ -173,7 +168,7 @@ fn fetch(input: &TileInput, (first, keys): (usize, &[u64]), fetched: &mut Vec<Cu
 #[inline(always)]
 fn unblend_splat<const FMA: bool>(input: &TileInput, cut: &Cut, scratch: &mut UnblendScratch) -> bool {
     let record = &cut.record;
-    let features = &input.features[cut.id as usize * input.feature_count..][..input.feature_count];
+    let features = input.features.of(cut.id);
     let planes = BASE_PLANES + features.len();
     let left = (input.x0 as f32 - f32::from(record.x0)) + 0.5;
     let top = (input.y0 as f32 - f32::from(record.y0)) + 0.5;

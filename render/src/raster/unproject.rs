@@ -129,7 +129,7 @@ fn pull_back<const FMA: bool>(block: &Block, camera: &Camera, blur: f64, from: &
     let (m_q, m_y, m_depth) = (moment(Moment::Q), moment(Moment::Y), moment(Moment::Depth));
     let (m_qq, m_qy, m_yy) = (moment(Moment::QQ), moment(Moment::QY), moment(Moment::YY));
     for l in 0..LANES {
-        let (mx, my, mz) = (block.mean[0][l], block.mean[1][l], block.mean[2][l]);
+        let (mx, my, mz) = (block.centers.mean[0][l], block.centers.mean[1][l], block.centers.mean[2][l]);
         let place =
             |row: &[f64; 3], t: f64| fma64::<FMA>(row[0], mx, fma64::<FMA>(row[1], my, fma64::<FMA>(row[2], mz, t)));
         let (x, y, z) = (place(&r[0], t[0]), place(&r[1], t[1]), place(&r[2], t[2]));
@@ -141,7 +141,7 @@ fn pull_back<const FMA: bool>(block: &Block, camera: &Camera, blur: f64, from: &
         // Rows of J W are jx n0 and jy n1.
         let n0: [f64; 3] = std::array::from_fn(|k| fma64::<FMA>(-tangent_x, r[2][k], r[0][k]));
         let n1: [f64; 3] = std::array::from_fn(|k| fma64::<FMA>(-tangent_y, r[2][k], r[1][k]));
-        let axes: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| block.axes[i][k][l]));
+        let axes: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| block.shapes.axes[i][k][l]));
         let g0: [f64; 3] = std::array::from_fn(|k| {
             jx * fma64::<FMA>(n0[0], axes[0][k], fma64::<FMA>(n0[1], axes[1][k], n0[2] * axes[2][k]))
         });

@@ -1,41 +1,42 @@
 //! Every renderer against the slow reference, and the device against the CPU.
 
-use super::backends::each;
+use super::backends::{Backend, each};
 use super::scenes::{KINDS, Kind, Scene, both_conventions, front_view, turned_view};
 use storm_render::View;
-use storm_render::raster::{RasterSettings, reference};
+use storm_render::raster::{Picture, RasterSettings, reference};
 
 /// Where a decision is close: a splat of alpha 1/255 more or less and, for two splats of equal depth, their order.
 const FRAGILE_TOLERANCE: f32 = 2e-2;
 
 /// Compares every renderer with the reference.
 fn compare(settings: RasterSettings, scene: &Scene, views: &[View]) {
-    let slow = reference::render_with_fragile(&settings, &scene.splats(), views).unwrap();
     each(settings, |backend| {
         let fast = backend.renderer.render(&scene.splats(), views).unwrap();
-        assert_eq!(fast.len(), views.len());
-        for (fast, (slow, fragile)) in fast.iter().zip(&slow) {
-            assert_eq!((fast.width, fast.height, fast.feature_count), (slow.width, slow.height, slow.feature_count));
-            for pixel in 0..fragile.len() {
-                let tolerance = if fragile[pixel] { FRAGILE_TOLERANCE } else { backend.color_tolerance };
-                let close = |a: f32, b: f32, tolerance: f32| {
-                    let who = backend.renderer.describe();
-                    assert!(
-                        (a - b).abs() <= tolerance,
-                        "pixel {pixel}: {a}, not {b}, fragile {}, {who}",
-                        fragile[pixel]
-                    );
-                };
-                close(fast.alpha[pixel], slow.alpha[pixel], tolerance);
-                for c in pixel * fast.feature_count..(pixel + 1) * fast.feature_count {
-                    close(fast.features[c], slow.features[c], tolerance);
-                }
-                if !fragile[pixel] {
-                    close(fast.depth[pixel], slow.depth[pixel], backend.depth_tolerance);
-                }
+        check_pictures(settings, scene, views, &fast, backend);
+    });
+}
+
+/// Compares a renderer's pictures with the reference's.
+pub fn check_pictures(settings: RasterSettings, scene: &Scene, views: &[View], fast: &[Picture], backend: &Backend) {
+    let slow = reference::render_with_fragile(&settings, &scene.splats(), views).unwrap();
+    assert_eq!(fast.len(), views.len());
+    for (fast, (slow, fragile)) in fast.iter().zip(&slow) {
+        assert_eq!((fast.width, fast.height, fast.feature_count), (slow.width, slow.height, slow.feature_count));
+        for pixel in 0..fragile.len() {
+            let tolerance = if fragile[pixel] { FRAGILE_TOLERANCE } else { backend.color_tolerance };
+            let close = |a: f32, b: f32, tolerance: f32| {
+                let who = backend.renderer.describe();
+                assert!((a - b).abs() <= tolerance, "pixel {pixel}: {a}, not {b}, fragile {}, {who}", fragile[pixel]);
+            };
+            close(fast.alpha[pixel], slow.alpha[pixel], tolerance);
+            for c in pixel * fast.feature_count..(pixel + 1) * fast.feature_count {
+                close(fast.features[c], slow.features[c], tolerance);
+            }
+            if !fragile[pixel] {
+                close(fast.depth[pixel], slow.depth[pixel], backend.depth_tolerance);
             }
         }
-    });
+    }
 }
 
 #[test]

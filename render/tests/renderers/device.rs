@@ -3,7 +3,7 @@
 use super::backends::with_device;
 use super::scenes::{Kind, Scene, bits, front_view, turned_view};
 use storm_render::gpu::{GpuError, GpuOptions, GpuRasterizer, SOFTWARE_ADAPTER};
-use storm_render::raster::{RasterError, RasterSettings};
+use storm_render::raster::{Channels, RasterError, RasterSettings};
 use storm_render::renderer::{RenderError, Renderer};
 
 fn new_with(adapter_name: &str) -> Result<GpuRasterizer, RenderError> {
@@ -99,6 +99,34 @@ fn what_does_not_fit_the_device_is_refused() {
         let RenderError::Gpu(GpuError::TooLarge { value, .. }) = error else { panic!("{error}") };
         assert_eq!(value, 40_000 * 64 * 64);
         assert!(gpu.render(&Scene::copies(1, 3).splats(), &[front_view(8, 8)]).is_ok());
+    });
+}
+
+#[test]
+fn channels_that_do_not_fit_a_binding_go_through_several() {
+    let settings = RasterSettings::default();
+    let mut scene = Scene::random(6, Kind::Mixed, 2000, 22);
+    // One that only the last part of the features tells.
+    scene.features[22 * 7 + 21] = f32::NAN;
+    scene.features[22 * 7 + 1] = f32::INFINITY;
+    let views = [front_view(120, 90), front_view(40, 30)];
+    with_device(settings, |gpu| {
+        let whole = gpu.render(&scene.splats(), &views).unwrap();
+        let stats = gpu.stats();
+        // 8,000 bytes a channel of the Gaussians, so two parts of 12 and 10; 43,200 a channel of the picture, so pairs.
+        let options = GpuOptions { binding_bytes: Some(100_000), ..GpuOptions::default() };
+        let mut small = GpuRasterizer::new(settings, &options).unwrap();
+        let parts = small.render(&scene.splats(), &views).unwrap();
+        assert_eq!(bits(&parts), bits(&whole));
+        assert_eq!((small.stats(), stats.invalid), (stats, 1));
+        // A range across the parts, after other numbers of channels.
+        let name = small.load(&scene.splats(), None).unwrap();
+        let some = small.draw(name, 0.0, &Channels(10..15), &views).unwrap();
+        let wanted: Vec<f32> = whole[0].features.chunks_exact(22).flat_map(|row| &row[10..15]).copied().collect();
+        assert_eq!(some[0].features, wanted);
+        // Not even one channel of this picture fits.
+        let error = small.draw(name, 0.0, &Channels(0..1), &[front_view(400, 300)]).unwrap_err();
+        assert!(matches!(error, RenderError::Gpu(GpuError::TooLarge { .. })), "{error}");
     });
 }
 

@@ -11,6 +11,7 @@ mod degenerate;
 #[cfg(feature = "wgpu")]
 mod device;
 mod goldens;
+mod motion;
 mod requests;
 mod rules;
 mod scenes;

@@ -142,12 +142,12 @@ fn one_splat_can_cover_the_whole_picture() {
 }
 
 #[test]
-fn a_hundred_thousand_splats_at_one_point() {
-    let scene = Scene::copies(100_000, 1);
+fn a_million_splats_at_one_point() {
+    let scene = Scene::copies(1_000_000, 1);
     let mut rasterizer = CpuRasterizer::new(RasterSettings::default()).unwrap();
     let pictures = rasterizer.render(&scene.splats(), &[front_view(64, 48)]).unwrap();
     assert_finite(&pictures[0]);
-    assert_eq!(rasterizer.stats().visible, 100_000);
+    assert_eq!(rasterizer.stats().visible, 1_000_000);
     let centre = 20 * 64 + 35;
     // 0.5^13 > 1e-4 >= 0.5^14: thirteen splats of nearly 0.5 each are blended before the pixel is full.
     assert!(pictures[0].alpha[centre] > 0.999, "{}", pictures[0].alpha[centre]);

@@ -5,5 +5,6 @@ mod degenerate;
 mod differences;
 mod golden;
 mod gradients;
+mod loaded;
 mod properties;
 mod scenes;
