@@ -4,4 +4,5 @@
 mod adam;
 mod dice;
 pub mod gs3d;
+pub mod nearest;
 pub mod nsfp;

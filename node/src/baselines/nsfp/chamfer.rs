@@ -1,37 +1,11 @@
 //! Truncated Chamfer distance with its gradient.
 
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
+
+use crate::baselines::nearest::Cloud;
 
 /// Squared distances from here on are no correspondence and count nothing, m^2 (NSFP).
 pub const TRUNCATE_M2: f32 = 2.0;
-
-/// Points that can be asked for their nearest.
-pub struct Cloud {
-    points: Vec<[f32; 3]>,
-    tree: Option<ImmutableKdTree<f32, 3>>,
-}
-
-impl Cloud {
-    /// Built by one thread: the same points give the same tree everywhere.
-    pub fn new(points: Vec<[f32; 3]>) -> Self {
-        let tree = (!points.is_empty())
-            .then(|| ImmutableKdTree::builder().with_serial_construction().build_from_slice(&points).ok())
-            .flatten();
-        Self { points, tree }
-    }
-
-    /// The points.
-    pub fn points(&self) -> &[[f32; 3]] {
-        &self.points
-    }
-
-    /// Index and squared distance of the nearest point.
-    pub fn nearest(&self, p: &[f32; 3]) -> Option<(usize, f32)> {
-        let hit = self.tree.as_ref()?.query(p).nearest_one::<SquaredEuclidean<f32>>().execute();
-        Some((hit.item as usize, hit.distance))
-    }
-}
 
 fn nearest_all(cloud: &Cloud, from: &[[f32; 3]]) -> Vec<Option<(usize, f32)>> {
     from.par_iter().map(|p| cloud.nearest(p).filter(|(_, d2)| *d2 < TRUNCATE_M2)).collect()
@@ -40,7 +14,7 @@ fn nearest_all(cloud: &Cloud, from: &[[f32; 3]]) -> Vec<Option<(usize, f32)>> {
 /// Mean squared distance from each cloud to the other's nearest points, and its gradient with respect to `moved`.
 pub fn chamfer(moved: &[[f32; 3]], target: &Cloud) -> (f64, Vec<[f32; 3]>) {
     let mut gradient = vec![[0f32; 3]; moved.len()];
-    if moved.is_empty() || target.points.is_empty() {
+    if moved.is_empty() || target.points().is_empty() {
         return (0.0, gradient);
     }
     let mut loss = 0f64;
@@ -48,12 +22,12 @@ pub fn chamfer(moved: &[[f32; 3]], target: &Cloud) -> (f64, Vec<[f32; 3]>) {
     for ((hit, p), g) in nearest_all(target, moved).into_iter().zip(moved).zip(&mut gradient) {
         let Some((at, d2)) = hit else { continue };
         loss += f64::from(d2 * share);
-        let q = &target.points[at];
+        let q = &target.points()[at];
         (0..3).for_each(|k| g[k] += 2.0 * share * (p[k] - q[k]));
     }
-    let share = 1.0 / target.points.len() as f32;
+    let share = 1.0 / target.points().len() as f32;
     let cloud = Cloud::new(moved.to_vec());
-    for (hit, q) in nearest_all(&cloud, &target.points).into_iter().zip(&target.points) {
+    for (hit, q) in nearest_all(&cloud, target.points()).into_iter().zip(target.points()) {
         let Some((at, d2)) = hit else { continue };
         loss += f64::from(d2 * share);
         (0..3).for_each(|k| gradient[at][k] += 2.0 * share * (moved[at][k] - q[k]));

@@ -8,11 +8,12 @@
 mod chamfer;
 mod mlp;
 
-use chamfer::{Cloud, chamfer};
+use chamfer::chamfer;
 use mlp::{LEN, Mlp};
 
 use super::adam::Adam;
 use super::dice::Dice;
+use super::nearest::Cloud;
 
 /// Most points of a cloud that a fit sees.
 pub const POINTS: usize = 2048;
