@@ -89,6 +89,8 @@ fn sample<T: Copy>(data: &[T], image: &TruthImage, (width, height): (usize, usiz
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
 
     #[test]

@@ -166,7 +166,14 @@ impl Optimizer {
 
     /// One step; `g` is with respect to what was drawn, and is turned into the parameters' own gradient in place.
     /// `progress` runs from 0 to 1 over the optimisation.
-    pub fn step(&mut self, p: &mut Params, g: &mut SplatGradients, scales: &[[f32; 3]], opacities: &[f32], progress: f32) {
+    pub fn step(
+        &mut self,
+        p: &mut Params,
+        g: &mut SplatGradients,
+        scales: &[[f32; 3]],
+        opacities: &[f32],
+        progress: f32,
+    ) {
         for (g, s) in g.scales.iter_mut().zip(scales) {
             (0..3).for_each(|k| g[k] *= s[k]);
         }

@@ -11,10 +11,11 @@ fn nearest_all(cloud: &Cloud, from: &[[f32; 3]]) -> Vec<Option<(usize, f32)>> {
     from.par_iter().map(|p| cloud.nearest(p).filter(|(_, d2)| *d2 < TRUNCATE_M2)).collect()
 }
 
-/// Mean squared distance from each cloud to the other's nearest points, and its gradient with respect to `moved`.
-pub fn chamfer(moved: &[[f32; 3]], target: &Cloud) -> (f64, Vec<[f32; 3]>) {
+/// Mean squared distance from `moved` to the nearest of `target`, and from `asked`, some points of `target`, to the nearest
+/// of `moved`; and the gradient with respect to `moved`.
+pub fn chamfer(moved: &[[f32; 3]], target: &Cloud, asked: &[[f32; 3]]) -> (f64, Vec<[f32; 3]>) {
     let mut gradient = vec![[0f32; 3]; moved.len()];
-    if moved.is_empty() || target.points().is_empty() {
+    if moved.is_empty() || asked.is_empty() {
         return (0.0, gradient);
     }
     let mut loss = 0f64;
@@ -25,9 +26,9 @@ pub fn chamfer(moved: &[[f32; 3]], target: &Cloud) -> (f64, Vec<[f32; 3]>) {
         let q = &target.points()[at];
         (0..3).for_each(|k| g[k] += 2.0 * share * (p[k] - q[k]));
     }
-    let share = 1.0 / target.points().len() as f32;
+    let share = 1.0 / asked.len() as f32;
     let cloud = Cloud::new(moved.to_vec());
-    for (hit, q) in nearest_all(&cloud, target.points()).into_iter().zip(target.points()) {
+    for (hit, q) in nearest_all(&cloud, asked).into_iter().zip(asked) {
         let Some((at, d2)) = hit else { continue };
         loss += f64::from(d2 * share);
         (0..3).for_each(|k| gradient[at][k] += 2.0 * share * (moved[at][k] - q[k]));
@@ -51,7 +52,7 @@ mod tests {
             let nearest = |p| to.iter().map(|q| d2(p, q)).fold(f32::INFINITY, f32::min);
             from.iter().map(nearest).filter(|d| *d < TRUNCATE_M2).map(f64::from).sum::<f64>() / from.len() as f64
         };
-        let (loss, gradient) = chamfer(&a, &target);
+        let (loss, gradient) = chamfer(&a, &target, &b);
         assert!((loss - one_way(&a, &b) - one_way(&b, &a)).abs() < 1e-5, "{loss}");
         // f32 distances: rounding of 1e-6 over the step; a change of neighbour within it is of second order.
         let step = 2e-3f32;
@@ -59,12 +60,12 @@ mod tests {
             let at = |d: f32| {
                 let mut moved = a.clone();
                 moved[i][1] += d;
-                chamfer(&moved, &target).0
+                chamfer(&moved, &target, &b).0
             };
             let slope = (at(step) - at(-step)) / f64::from(2.0 * step);
             assert!((slope - f64::from(gradient[i][1])).abs() < 2e-3, "{slope} {}", gradient[i][1]);
         }
-        assert_eq!(chamfer(&[], &target).0, 0.0);
-        assert_eq!(chamfer(&a, &Cloud::new(Vec::new())).0, 0.0);
+        assert_eq!(chamfer(&[], &target, &b).0, 0.0);
+        assert_eq!(chamfer(&a, &Cloud::new(Vec::new()), &[]).0, 0.0);
     }
 }

@@ -2,11 +2,14 @@
 //!
 //! A network moves the first cloud onto the second, another one moves the result back onto the first (cycle); both are
 //! fitted to the truncated Chamfer distance with Adam and early stopping. Smaller than the original (4 hidden layers of 64
-//! instead of 8 of 128) and on at most 2,048 points of each cloud, so that a CPU does it in seconds; coordinates are divided
-//! by 10 m before they enter the network.
+//! instead of 8 of 128), and it moves at most 2,048 points of a cloud, so that a CPU does it in seconds; their nearest ones are
+//! sought in the other's whole cloud. Coordinates are divided by 10 m before they enter the network. Ground is left out, as
+//! usual with this method: a sensor that moves sees it in a pattern that moves along.
 
 mod chamfer;
 mod mlp;
+
+use std::collections::BTreeMap;
 
 use chamfer::chamfer;
 use mlp::{LEN, Mlp};
@@ -15,7 +18,7 @@ use super::adam::Adam;
 use super::dice::Dice;
 use super::nearest::Cloud;
 
-/// Most points of a cloud that a fit sees.
+/// Most points of a cloud that are moved.
 pub const POINTS: usize = 2048;
 /// Metres that count as 1 in the network.
 const UNIT_M: f32 = 10.0;
@@ -24,6 +27,10 @@ const RATE: f32 = 8e-3;
 const EPS: f32 = 1e-8;
 /// The fit ends after this many iterations without a better loss (NSFP).
 const PATIENCE: u64 = 100;
+/// Points lower than this above the lowest one of their cell are ground, metres (usual for Argoverse).
+const GROUND_M: f32 = 0.3;
+/// Edge of the cells, metres: the road rises less than [`GROUND_M`] across one.
+const GROUND_CELL_M: f32 = 4.0;
 /// Most iterations of a fit.
 pub const ITERATIONS: u64 = 500;
 
@@ -53,6 +60,17 @@ fn sample(points: &[[f32; 3]], dice: &mut Dice) -> Vec<[f32; 3]> {
     order.into_iter().map(|i| points[i]).collect()
 }
 
+/// Which points are ground: those less than [`GROUND_M`] above the lowest point of their cell (z is up).
+pub fn ground(points: &[[f32; 3]]) -> Vec<bool> {
+    let cell = |p: &[f32; 3]| ((p[0] / GROUND_CELL_M).floor() as i64, (p[1] / GROUND_CELL_M).floor() as i64);
+    let mut lowest: BTreeMap<(i64, i64), f32> = BTreeMap::new();
+    for p in points {
+        let low = lowest.entry(cell(p)).or_insert(p[2]);
+        *low = low.min(p[2]);
+    }
+    points.iter().map(|p| lowest.get(&cell(p)).is_some_and(|low| p[2] - low < GROUND_M)).collect()
+}
+
 impl Flow {
     /// Fits the flow that takes `from` to `to`, metres. `None` when a cloud is empty.
     pub fn fit(from: &[[f32; 3]], to: &[[f32; 3]], iterations: u64, seed: u64) -> Option<Self> {
@@ -60,18 +78,20 @@ impl Flow {
             return None;
         }
         let mut dice = Dice::new(seed);
+        let (all_from, all_to) = (Cloud::new(from.to_vec()), Cloud::new(to.to_vec()));
         let (from, to) = (sample(from, &mut dice), sample(to, &mut dice));
         let (mut forward, mut backward) = (Mlp::new(&mut dice), Mlp::new(&mut dice));
         let (mut adam_f, mut adam_b) = (Adam::new(LEN, EPS), Adam::new(LEN, EPS));
-        let (from_scaled, from, to) = (scaled(&from), Cloud::new(from), Cloud::new(to));
-        let mut best = Self { forward: forward.clone(), backward: backward.clone(), loss: f64::INFINITY, iterations: 0 };
+        let from_scaled = scaled(&from);
+        let mut best =
+            Self { forward: forward.clone(), backward: backward.clone(), loss: f64::INFINITY, iterations: 0 };
         let mut waited = 0;
         for iteration in 0..iterations {
-            let there = moved(from.points(), &forward.forward(&from_scaled));
+            let there = moved(&from, &forward.forward(&from_scaled));
             let there_scaled = scaled(&there);
             let back = moved(&there, &backward.forward(&there_scaled));
-            let (loss_there, by_there) = chamfer(&there, &to);
-            let (loss_back, by_back) = chamfer(&back, &from);
+            let (loss_there, by_there) = chamfer(&there, &all_to, &to);
+            let (loss_back, by_back) = chamfer(&back, &all_from, &from);
             let loss = loss_there + loss_back;
             best.iterations = iteration + 1;
             if loss < best.loss {
@@ -123,6 +143,12 @@ mod tests {
         let mut after = points.clone();
         after[floor..].iter_mut().for_each(|p| (0..3).for_each(|k| p[k] += step[k]));
         (points, after, floor)
+    }
+
+    #[test]
+    fn ground_is_what_lies_lowest() {
+        let points = [[0.1, 0.1, 2.0], [1.0, 3.0, 2.2], [2.0, 1.0, 2.5], [9.0, 0.0, 7.0], [-0.1, 0.0, 9.0]];
+        assert_eq!(ground(&points), [true, true, false, true, true]);
     }
 
     #[test]

@@ -14,7 +14,8 @@ fn number(value: Option<f64>, unit: &str) -> String {
 
 /// Figures in rows with their unit, methods in columns; figures that no method has are left out.
 fn rows(methods: &[(&str, &Figures)]) -> Vec<Vec<String>> {
-    let mut out = vec![std::iter::once(String::new()).chain(methods.iter().map(|(name, _)| name.to_string())).collect()];
+    let mut out =
+        vec![std::iter::once(String::new()).chain(methods.iter().map(|(name, _)| name.to_string())).collect()];
     let all: Vec<_> = methods.iter().map(|(_, figures)| figures.rows()).collect();
     let count = all.first().map_or(0, |rows| rows.len());
     for k in 0..count {

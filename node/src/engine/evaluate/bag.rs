@@ -9,7 +9,7 @@ use anyhow::{Result, bail};
 use storm_render::Intrinsics;
 
 use super::{Clip, TAIL_SEC};
-use crate::config::Config;
+use crate::config::{Config, WindowConfig};
 use crate::engine::truth::TruthAt;
 use crate::pipeline::front::{Front, FrontOutput, TruthImage};
 use crate::pipeline::posed::PoseStore;
@@ -75,7 +75,7 @@ impl BagClips {
             Ok(true)
         })?;
         let zero_ns = sets.first().map_or(0, |s| s.1);
-        let plans = plan(&sets, &windows, config.window.timesteps, zero_ns, part);
+        let plans = plan(&sets, &windows, &config.window, zero_ns, part);
         if plans.is_empty() {
             bail!(
                 "{} has no window of {} timesteps {} s apart with frames between them from {} s to {} s ({} synchronized sets)",
@@ -164,22 +164,34 @@ fn run_front(source: &BagSource, config: &Config, mut each: impl FnMut(FrontOutp
     Ok(())
 }
 
-/// Chooses windows with frames besides their `timesteps` evenly over the part; those whose half second afterwards is recorded too, if there are any.
-fn plan(sets: &[(u32, i64)], windows: &[Span], timesteps: usize, zero_ns: i64, part: &Part) -> Vec<Plan> {
+/// Chooses windows that have frames besides their timesteps, evenly over the part. If there are any, only those that span
+/// what they should (the first ones of a recording are short), and whose half second afterwards is recorded too.
+fn plan(sets: &[(u32, i64)], windows: &[Span], config: &WindowConfig, zero_ns: i64, part: &Part) -> Vec<Plan> {
     let from_ns = zero_ns.saturating_add(signed_ns(part.from_sec));
     let to_ns = if part.to_sec.is_finite() { zero_ns.saturating_add(signed_ns(part.to_sec)) } else { i64::MAX };
     let tail_ns = signed_ns(TAIL_SEC);
+    let wanted_ns = signed_ns(config.stride_sec).saturating_mul(config.timesteps.saturating_sub(1) as i64);
+    let mut sets = sets.to_vec();
+    sets.sort_unstable();
+    let before = |epoch: u32, ns: i64| sets.partition_point(|s| *s < (epoch, ns));
     let mut plans = Vec::new();
     for &window in windows.iter().filter(|w| w.first_ns >= from_ns && w.last_ns <= to_ns) {
-        let end_ns = window.last_ns.saturating_add(tail_ns).min(to_ns.saturating_add(1));
-        let own = |s: &&(u32, i64)| s.0 == window.epoch && s.1 >= window.first_ns;
-        let inside = sets.iter().filter(own).filter(|s| s.1 < end_ns).count();
-        let newest_ns = sets.iter().filter(own).map(|s| s.1).max().unwrap_or(window.last_ns);
-        let period_ns = (window.last_ns - window.first_ns) / (inside.max(2) as i64 - 1);
-        let complete = newest_ns.min(to_ns).saturating_add(period_ns) >= window.last_ns.saturating_add(tail_ns);
-        plans.push((Plan { window, end_ns }, inside, complete));
+        let Span { epoch, first_ns, last_ns } = window;
+        let end_ns = last_ns.saturating_add(tail_ns).min(to_ns.saturating_add(1));
+        let start = before(epoch, first_ns);
+        let span_ns = last_ns.saturating_sub(first_ns);
+        let gaps = before(epoch, last_ns).saturating_sub(start).max(1);
+        let period_ns = span_ns / gaps as i64;
+        let newest_ns = before(epoch.saturating_add(1), i64::MIN).checked_sub(1).map_or(last_ns, |i| sets[i].1);
+        let full = span_ns.abs_diff(wanted_ns) <= period_ns.unsigned_abs().div_ceil(2);
+        let complete = newest_ns.min(to_ns).saturating_add(period_ns) >= last_ns.saturating_add(tail_ns);
+        if before(epoch, end_ns).saturating_sub(start) > config.timesteps {
+            plans.push((Plan { window, end_ns }, full, complete));
+        }
     }
-    plans.retain(|(_, inside, _)| *inside > timesteps);
+    if plans.iter().any(|p| p.1) {
+        plans.retain(|p| p.1);
+    }
     if plans.iter().any(|p| p.2) {
         plans.retain(|p| p.2);
     }
@@ -216,7 +228,9 @@ impl Cutter {
     /// Whether a stamp lies in a clip still to come, with room for cameras that are not quite together.
     fn wanted(&self, stamp_ns: i64) -> bool {
         let room_ns = signed_ns(LATE_SEC);
-        self.plans.iter().any(|p| stamp_ns >= p.window.first_ns - room_ns && stamp_ns < p.end_ns.saturating_add(room_ns))
+        self.plans
+            .iter()
+            .any(|p| stamp_ns >= p.window.first_ns - room_ns && stamp_ns < p.end_ns.saturating_add(room_ns))
     }
 
     fn set(&mut self, set: Arc<PosedSet<Frame>>) {
@@ -302,27 +316,38 @@ mod tests {
     fn clips_are_spread_evenly_and_stay_in_their_part() {
         let (sets, windows) = recording(101);
         let part = Part { from_sec: 0.0, to_sec: f64::INFINITY, clips: 5 };
-        let plans = plan(&sets, &windows, 4, ZERO_NS, &part);
+        let plans = plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &part);
         // 20 frames each: the last one starts at frame 81 of 101.
         assert_eq!(starts(&plans), [0, 20, 41, 61, 81]);
         assert_eq!(plans[0].end_ns - ZERO_NS, 20 * STEP_NS);
         let half = Part { from_sec: 5.0, ..part };
-        let plans = plan(&sets, &windows, 4, ZERO_NS, &half);
+        let plans = plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &half);
         assert_eq!((starts(&plans)[0], starts(&plans)[4]), (50, 81));
         let first = Part { to_sec: 5.0, ..part };
-        let plans = plan(&sets, &windows, 4, ZERO_NS, &first);
+        let plans = plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &first);
         assert!(plans.iter().all(|p| p.end_ns <= ZERO_NS + 50 * STEP_NS + 1), "{plans:?}");
         assert_eq!(starts(&plans)[0], 0);
         let one = Part { clips: 1, ..part };
-        assert_eq!(starts(&plan(&sets, &windows, 4, ZERO_NS, &one)), [41]);
-        assert!(plan(&sets, &windows, 4, ZERO_NS, &Part { clips: 0, ..part }).is_empty());
-        assert!(plan(&sets, &windows, 4, ZERO_NS, &Part { from_sec: 9.0, ..part }).is_empty());
+        assert_eq!(starts(&plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &one)), [41]);
+        assert!(plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &Part { clips: 0, ..part }).is_empty());
+        assert!(plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &Part { from_sec: 9.0, ..part }).is_empty());
+    }
+
+    #[test]
+    fn short_first_windows_are_left_out() {
+        let (sets, mut windows) = recording(40);
+        // What the window builder gives first at 10 Hz: frames 0, 4, 9 and 14.
+        let first = Span { last_ns: ZERO_NS + 14 * STEP_NS, ..windows[0] };
+        windows.insert(0, first);
+        let part = Part { from_sec: 0.0, to_sec: f64::INFINITY, clips: 100 };
+        let plans = plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &part);
+        assert!(plans.iter().all(|p| p.window != first) && starts(&plans) == (0..=20).collect::<Vec<i64>>());
     }
 
     #[test]
     fn a_recording_that_ends_with_its_window_is_still_used() {
         let (sets, windows) = recording(16);
         let part = Part { from_sec: 0.0, to_sec: f64::INFINITY, clips: 3 };
-        assert_eq!(starts(&plan(&sets, &windows, 4, ZERO_NS, &part)), [0]);
+        assert_eq!(starts(&plan(&sets, &windows, &WindowConfig::default(), ZERO_NS, &part)), [0]);
     }
 }

@@ -93,10 +93,8 @@ impl Clip {
         tracks: Vec<TrackTruth>,
     ) -> Self {
         let context = |stamp_ns: i64| window.steps.iter().position(|s| s.stamp_ns == stamp_ns);
-        let frames = frames
-            .into_iter()
-            .map(|(set, truth)| ClipFrame { context: context(set.stamp_ns), set, truth })
-            .collect();
+        let frames =
+            frames.into_iter().map(|(set, truth)| ClipFrame { context: context(set.stamp_ns), set, truth }).collect();
         Self { name, seed, window, reference, frames, cameras, tracks }
     }
 

@@ -42,7 +42,10 @@ pub struct Effort {
 
 impl Default for Effort {
     fn default() -> Self {
-        Self { gs3d_iterations: crate::baselines::gs3d::ITERATIONS, nsfp_iterations: crate::baselines::nsfp::ITERATIONS }
+        Self {
+            gs3d_iterations: crate::baselines::gs3d::ITERATIONS,
+            nsfp_iterations: crate::baselines::nsfp::ITERATIONS,
+        }
     }
 }
 
@@ -135,7 +138,9 @@ fn predict(
         Method::Storm => one(scene.clone()),
         Method::Static => one(prediction::still(scene.clone())),
         Method::PerFrame => Some(Prediction::Scenes(per_frame::scenes(clip, per_frame, per_frame::Use::All)?)),
-        Method::PerFrameNearest => Some(Prediction::Scenes(per_frame::scenes(clip, per_frame, per_frame::Use::Nearest)?)),
+        Method::PerFrameNearest => {
+            Some(Prediction::Scenes(per_frame::scenes(clip, per_frame, per_frame::Use::Nearest)?))
+        }
         Method::Gs3d => Some(gs3d::from_pictures(clip, config(), effort.gs3d_iterations, tick)?),
         Method::Gs3dInit => Some(gs3d::from_scene(clip, scene, effort.gs3d_iterations, tick)?),
         Method::Nsfp => nsfp::flow(clip, effort.nsfp_iterations, tick),

@@ -4,13 +4,13 @@ use glam::Vec3;
 
 use super::clip::unproject;
 use super::{Clip, Prediction};
-use crate::baselines::nsfp::Flow;
+use crate::baselines::nsfp::{Flow, ground};
 use crate::sync::clock::seconds_between;
 
-/// Points beyond this are neither fitted nor moved, metres of z-depth: what a vehicle's LiDAR reaches.
+/// Points beyond this (and the ground) are neither fitted nor moved, metres of z-depth: what a vehicle's LiDAR reaches.
 const REACH_M: f32 = 80.0;
 
-/// The points of one context frame, all cameras: which pixels, and where in the window's frame.
+/// The points of one context frame off the ground, all cameras: which pixels, and where in the window's frame (z up).
 struct Points {
     pixels: Vec<(usize, usize)>,
     places: Vec<[f32; 3]>,
@@ -26,6 +26,11 @@ fn points(clip: &Clip, step: usize) -> Option<Points> {
             out.places.push(unproject(view, i, z).to_array());
         }
     }
+    let ground = ground(&out.places);
+    let mut keep = ground.iter();
+    out.pixels.retain(|_| keep.next() == Some(&false));
+    let mut keep = ground.iter();
+    out.places.retain(|_| keep.next() == Some(&false));
     Some(out)
 }
 

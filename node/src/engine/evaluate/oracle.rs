@@ -11,8 +11,9 @@ use storm_render::Gaussians;
 use super::clip::unproject;
 use super::{Clip, ClipFrame};
 
-/// Standard deviation of a Gaussian in its own picture, pixels: neighbours overlap without a gap.
-const FOOTPRINT_PX: f32 = 0.6;
+/// Standard deviation of a Gaussian in its own picture, pixels, before the rasteriser's blur (which closes the gaps). Of 0.3,
+/// 0.45 and 0.6 the smallest gave the best pictures at 96x64: 24.3, 24.0, 23.4 dB over seeds 10,000 to 10,002.
+const FOOTPRINT_PX: f32 = 0.3;
 /// The sky lies at this part of the far plane.
 const SKY_OF_FAR: f32 = 0.9;
 
@@ -79,7 +80,15 @@ pub(super) fn scene(clip: &Clip, config: &Arc<ModelConfig>, motion: Motion) -> O
     // The true flow needs no gate against noise.
     let config = Arc::new(ModelConfig { flow_gate_mps: 0.0, ..ModelConfig::clone(config) });
     let motion_bases = Vec::new();
-    (g.len() == shape.len()).then_some(Scene { gaussians: g, shape, depths, sky: None, affine: Vec::new(), motion_bases, config })
+    (g.len() == shape.len()).then_some(Scene {
+        gaussians: g,
+        shape,
+        depths,
+        sky: None,
+        affine: Vec::new(),
+        motion_bases,
+        config,
+    })
 }
 
 /// Mean flow of every moving object's pixels, all cameras together, in the first context frame that shows it, map axes.

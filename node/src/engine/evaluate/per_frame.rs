@@ -5,8 +5,8 @@ use glam::{Quat, Vec3};
 use storm_model::scene::{Scene, SceneShape};
 use storm_render::Gaussians;
 
-use super::prediction::{Placed, still};
 use super::Clip;
+use super::prediction::{Placed, still};
 use crate::engine::Engine;
 use crate::rigid::Rigid;
 use crate::window::{Window, camera_from_flu, relative};
@@ -73,4 +73,3 @@ fn append(to: &mut Gaussians, from: &Gaussians, to_from_from: &Rigid) {
     to.time_sec.extend_from_slice(&from.time_sec);
     to.motion_weights.extend_from_slice(&from.motion_weights);
 }
-

@@ -180,10 +180,8 @@ impl Tally {
                 self.three_way.iter_mut().zip(values).for_each(|(mean, value)| mean.add(value));
             }
         }
-        let frames: Vec<FlowFrame> = known
-            .iter()
-            .map(|f| FlowFrame { pred: &f.pred, truth: &f.truth, depth: &f.depth, ground: None })
-            .collect();
+        let frames: Vec<FlowFrame> =
+            known.iter().map(|f| FlowFrame { pred: &f.pred, truth: &f.truth, depth: &f.depth, ground: None }).collect();
         Ok(self.flow.add(&frames)?)
     }
 

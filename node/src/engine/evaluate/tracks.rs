@@ -113,7 +113,13 @@ impl Links {
 }
 
 /// Places of a query at every timestep, in the window's frame.
-fn chain(clip: &Clip, track: &TrackTruth, clouds: &[StepCloud], links: &[Links], views: &[Vec<View>]) -> Option<Vec<Vec3>> {
+fn chain(
+    clip: &Clip,
+    track: &TrackTruth,
+    clouds: &[StepCloud],
+    links: &[Links],
+    views: &[Vec<View>],
+) -> Option<Vec<Vec3>> {
     let k = clip.cameras.get(track.camera)?;
     let (col, row) = ((track.pixel[0] as usize).min(k.width - 1), (track.pixel[1] as usize).min(k.height - 1));
     let pixels: usize = clip.cameras[..track.camera].iter().map(|c| c.width * c.height).sum();
