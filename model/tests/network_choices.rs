@@ -159,6 +159,24 @@ fn a_batch_is_its_windows() {
 }
 
 #[test]
+fn pictures_decoded_together_are_those_decoded_one_by_one() {
+    // 88 x 120 pixels: three pictures fit into one part, so a window of eight takes parts of 3, 3 and 2.
+    let storm = Storm::untrained(&small(), 5, &Device::Cpu).unwrap();
+    let batch = ClipBatch::stack(&[clip(4, 2, 88, 120), clip(4, 2, 88, 120)]).unwrap();
+    let together = storm.forward(&batch).unwrap();
+    // Asking for a stage of one picture makes the decoder go picture by picture.
+    let one_by_one = storm.forward_stages(&batch, &mut Stages::only(&["motion_keys"])).unwrap();
+    let pairs = [
+        (&together.velocity_forward, &one_by_one.velocity_forward),
+        (together.motion_weights.as_ref().unwrap(), one_by_one.motion_weights.as_ref().unwrap()),
+    ];
+    for (a, b) in pairs {
+        assert_eq!(a.dims(), b.dims());
+        assert!(worst(&values(a), &values(b)) <= 1e-6, "{}", worst(&values(a), &values(b)));
+    }
+}
+
+#[test]
 fn depth_meanings_place_gaussians_on_their_rays() {
     for (meaning, offset, shift) in [
         (DepthMeaning::ZDepth, RayPixelOffset::DoubleHalf, 1.0),

@@ -1,11 +1,11 @@
 //! Motion tokens and mask decoder: velocities as a soft mixture of a few bases (paper section 3.1).
 
-use candle_core::{D, Tensor};
+use candle_core::{D, Device, Tensor};
 
 use super::params::{Mlp, Params};
 use super::stages::Stages;
 use super::upsample::{Upsampler, unnest};
-use crate::config::{MaskDecoder, ModelConfig, VelocityKind};
+use crate::config::{MaskDecoder, ModelConfig, VelocityBases, VelocityKind, spread_bases};
 use crate::error::ModelError;
 use crate::ops::{Activation, Linear, linear, softmax};
 
@@ -34,9 +34,44 @@ pub(crate) struct MotionHead {
 /// The picture whose pixel-wise stages are kept for comparison: timestep 0, camera 1 (camera 0 of one-camera windows).
 const PROBED_PICTURE: usize = 1;
 
+/// Pixels that go through the upsampler and the decoder at a time: their features stay in the processor's caches, and a whole
+/// window's would not fit in memory at full size.
+const PART_PIXELS: usize = 1 << 15;
+
+/// Pictures of one window that are decoded together.
+struct Part {
+    window: usize,
+    first: usize,
+    count: usize,
+}
+
+/// All pictures in order, in parts within one window; one by one where stages of one picture are asked for.
+fn parts(windows: usize, pictures: usize, pixels: usize, one_by_one: bool) -> Vec<Part> {
+    let most = if one_by_one { 1 } else { (PART_PIXELS / pixels.max(1)).max(1) };
+    let of_window = |window: usize| {
+        (0..pictures).step_by(most).map(move |k| Part {
+            window,
+            first: window * pictures + k,
+            count: most.min(pictures - k),
+        })
+    };
+    (0..windows).flat_map(of_window).collect()
+}
+
 /// Dot products of every row of `x` with every row of `rows`.
 fn product(x: &Tensor, rows: Tensor) -> candle_core::Result<Tensor> {
     linear(x, &Linear::new(rows, None), Activation::None, None)
+}
+
+/// The velocities that spread bases start from, `(M, 3 | 6)`.
+fn fan(config: &ModelConfig, device: &Device) -> candle_core::Result<Tensor> {
+    let row = |v: [f32; 3]| match config.velocity {
+        VelocityKind::One => v.to_vec(),
+        // `v-` is the velocity for earlier times with its sign turned (paper eq. 1).
+        VelocityKind::ForwardBackward => [v.map(|x| -x), v].concat(),
+    };
+    let bases = spread_bases(config.num_motion_tokens).into_iter().flat_map(row).collect::<Vec<f32>>();
+    Tensor::from_vec(bases, (config.num_motion_tokens, config.velocity_channels()), device)
 }
 
 impl MotionHead {
@@ -75,20 +110,19 @@ impl MotionHead {
             stages.keep("motion_bases", bases);
         }
         let upsampler = self.upsampler.prepare()?;
-        let mut none = Stages::none();
         let (mut all_weights, mut all_velocities) = (Vec::new(), Vec::new());
-        // One picture at a time: pixel features of a whole window would not fit in memory at full size.
-        for picture in 0..b * t * v {
-            let probed = picture == PROBED_PICTURE.min(t * v - 1);
+        for Part { window, first, count } in parts(b, t * v, h * w, stages.asked()) {
+            let mut none = Stages::none();
+            let probed = first == PROBED_PICTURE.min(t * v - 1);
             let stages = if probed { &mut *stages } else { &mut none };
-            let features = upsampler.forward(&pictures.get(picture)?, grid, stages)?;
+            let tokens = pictures.narrow(0, first, count)?.reshape((count * grid.0 * grid.1, config.embed_dim))?;
+            let features = upsampler.forward(&tokens, grid, stages)?;
             let keys = self.keys.forward(&features)?;
             if stages.wants("motion_keys") {
-                stages.keep("motion_keys", &unnest(&keys, grid, levels)?);
+                stages.keep("motion_keys", &unnest(&keys, grid, levels)?.get(0)?);
             }
             let velocity = match &mixture {
                 Some((queries, bases)) => {
-                    let window = picture / (t * v);
                     let logits = product(&keys, queries.get(window)?)?;
                     let weights = softmax(&logits, config.tau)?;
                     let velocity = product(&weights, bases.get(window)?.t()?.contiguous()?)?;
@@ -99,9 +133,9 @@ impl MotionHead {
             };
             all_velocities.push(unnest(&velocity, grid, levels)?);
         }
-        let velocity = Tensor::stack(&all_velocities, 0)?.reshape((b, t, v, h, w, config.velocity_channels()))?;
+        let velocity = Tensor::cat(&all_velocities, 0)?.reshape((b, t, v, h, w, config.velocity_channels()))?;
         let weights = match all_weights.first() {
-            Some(first) => Some(Tensor::stack(&all_weights, 0)?.reshape((b, t, v, h, w, first.dim(2)?))?),
+            Some(first) => Some(Tensor::cat(&all_weights, 0)?.reshape((b, t, v, h, w, first.dim(3)?))?),
             None => None,
         };
         let (velocity_backward, velocity_forward) = match config.velocity {
@@ -127,6 +161,10 @@ impl MotionHead {
             own => each(own)?,
         };
         let bases = if config.velocity_scale == 1.0 { bases } else { (bases * config.velocity_scale)? };
+        let bases = match config.velocity_bases {
+            VelocityBases::Learned => bases,
+            VelocityBases::Spread => bases.broadcast_add(&fan(config, bases.device())?)?,
+        };
         Ok((queries, bases))
     }
 }

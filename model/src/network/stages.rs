@@ -45,6 +45,11 @@ impl Stages {
         self.tensors.keys().map(String::as_str)
     }
 
+    /// Whether any stage is to be kept.
+    pub(crate) fn asked(&self) -> bool {
+        !matches!(self.wanted, Wanted::Nothing)
+    }
+
     pub(crate) fn wants(&self, name: &str) -> bool {
         match &self.wanted {
             Wanted::Nothing => false,

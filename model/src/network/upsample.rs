@@ -59,7 +59,7 @@ impl Upsampler {
 }
 
 impl Prepared<'_> {
-    /// `(patches, d)` of one picture to `(patches * 4^stages, width)` in nested order.
+    /// `(patches, d)` of one or more pictures to `(patches * 4^stages, width)`, each picture in nested order.
     ///
     /// `grid` is used only to arrange the stages kept for comparison.
     pub fn forward(&self, patches: &Tensor, grid: (usize, usize), stages: &mut Stages) -> Result<Tensor> {
@@ -81,23 +81,24 @@ impl Prepared<'_> {
 fn keep(stages: &mut Stages, layer: usize, x: &Tensor, grid: (usize, usize), levels: usize) -> Result<()> {
     let name = format!("upscaling_{layer}");
     if stages.wants(&name) {
-        stages.keep(&name, &unnest(x, grid, levels)?);
+        stages.keep(&name, &unnest(x, grid, levels)?.get(0)?);
     }
     Ok(())
 }
 
-/// `(rows cols 4^levels, c)` in nested order to `(rows 2^levels, cols 2^levels, c)`.
+/// `(n rows cols 4^levels, c)`, each of the `n` pictures in nested order, to `(n, rows 2^levels, cols 2^levels, c)`.
 pub(crate) fn unnest(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<Tensor> {
-    let c = x.dim(1)?;
-    let mut shape = vec![grid.0, grid.1];
+    let (all, c) = x.dims2()?;
+    let side = 1 << levels;
+    let pictures = all / (grid.0 * grid.1 * side * side).max(1);
+    let mut shape = vec![pictures, grid.0, grid.1];
     shape.extend(std::iter::repeat_n(2, 2 * levels));
     shape.push(c);
-    // Axes: row, col, then (row bit, col bit) per level, coarse to fine.
-    let rows = std::iter::once(0).chain((0..levels).map(|k| 2 + 2 * k));
-    let cols = std::iter::once(1).chain((0..levels).map(|k| 3 + 2 * k));
-    let axes: Vec<usize> = rows.chain(cols).chain(std::iter::once(2 + 2 * levels)).collect();
-    let side = 1 << levels;
-    x.reshape(shape)?.permute(axes)?.contiguous()?.reshape((grid.0 * side, grid.1 * side, c))
+    // Axes: picture, row, col, then (row bit, col bit) per level, coarse to fine.
+    let rows = std::iter::once(1).chain((0..levels).map(|k| 3 + 2 * k));
+    let cols = std::iter::once(2).chain((0..levels).map(|k| 4 + 2 * k));
+    let axes: Vec<usize> = std::iter::once(0).chain(rows).chain(cols).chain(std::iter::once(3 + 2 * levels)).collect();
+    x.reshape(shape)?.permute(axes)?.contiguous()?.reshape((pictures, grid.0 * side, grid.1 * side, c))
 }
 
 #[cfg(test)]
@@ -127,7 +128,7 @@ mod tests {
         let upsampler = Upsampler(vec![layer(&w1, c1), layer(&w2, c2)]);
         let prepared = upsampler.prepare().unwrap();
         let ours = prepared.forward(&x, (rows, cols), &mut Stages::none()).unwrap();
-        let ours = unnest(&ours, (rows, cols), 2).unwrap();
+        let ours = unnest(&ours, (rows, cols), 2).unwrap().get(0).unwrap();
         let chw = x.reshape((1, rows, cols, d)).unwrap().permute((0, 3, 1, 2)).unwrap().contiguous().unwrap();
         let y = chw.conv_transpose2d(&w1, 0, 0, 2, 1).unwrap().gelu_erf().unwrap();
         let y = y.conv_transpose2d(&w2, 0, 0, 2, 1).unwrap().gelu_erf().unwrap();

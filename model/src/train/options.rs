@@ -6,6 +6,7 @@ use super::adamw::AdamOptions;
 use super::clips::ClipOptions;
 use super::error::TrainError;
 use super::losses::RenderLossOptions;
+use super::muon::Optimizer;
 use super::pixel::PixelLossOptions;
 use super::schedule::Schedule;
 
@@ -17,7 +18,7 @@ pub enum Stage {
     Pixel,
     /// The paper's: pictures drawn at other times against what the cameras saw.
     Render,
-    /// Both sums together.
+    /// Both sums together, the rendering losses from [`TrainOptions::render_from`] on.
     Both,
 }
 
@@ -35,6 +36,9 @@ pub struct TrainOptions {
     pub stage: Stage,
     /// Learning rate.
     pub schedule: Schedule,
+    /// What moves the blocks' matrices.
+    #[serde(default)]
+    pub optimizer: Optimizer,
     /// AdamW and clipping.
     pub adam: AdamOptions,
     /// Moving average of the weights: how much of it stays per step.
@@ -47,9 +51,24 @@ pub struct TrainOptions {
     pub clips: ClipOptions,
     /// Steps with one camera before all cameras are used.
     pub one_camera_steps: u64,
+    /// First step of [`Stage::Both`] that draws; before it only the pixels' truth is used.
+    #[serde(default)]
+    pub render_from: u64,
+    /// How many times each clip is shown.
+    #[serde(default = "once")]
+    pub reuse: u64,
+}
+
+fn once() -> u64 {
+    1
 }
 
 impl TrainOptions {
+    /// What step `step` learns from.
+    pub fn stage_at(&self, step: u64) -> Stage {
+        if self.stage == Stage::Both && step < self.render_from { Stage::Pixel } else { self.stage }
+    }
+
     /// Options for `steps` steps of `batch` samples with everything else usual.
     pub fn new(seed: u64, steps: u64, batch: usize, peak: f64) -> Self {
         let warmup_steps = (steps / 20).min(5000);
@@ -59,12 +78,15 @@ impl TrainOptions {
             batch,
             stage: Stage::Pixel,
             schedule: Schedule { peak, warmup_steps, steps, end_share: 0.01 },
+            optimizer: Optimizer::AdamW,
             adam: AdamOptions::default(),
             average_decay: 0.999,
             pixel: PixelLossOptions::default(),
             render: RenderLossOptions::default(),
             clips: ClipOptions::default(),
             one_camera_steps: 0,
+            render_from: 0,
+            reuse: 1,
         }
     }
 
@@ -80,6 +102,7 @@ impl TrainOptions {
         }
         let peak = self.schedule.peak;
         rule(peak > 0.0 && peak <= 1.0, "lr", peak, "more than 0, at most 1")?;
+        rule((1..=1000).contains(&self.reuse), "reuse", self.reuse as f64, "1 to 1000")?;
         rule(self.schedule.steps > 0, "steps", 0.0, "at least 1")?;
         rule(unit.contains(&self.average_decay), "average_decay", self.average_decay, "0 to below 1")?;
         let a = &self.adam;
@@ -96,6 +119,7 @@ impl TrainOptions {
             ("sky_color", p.sky_color),
             ("velocity", p.velocity),
             ("flow", p.flow),
+            ("groups", p.groups),
             ("render depth", self.render.depth),
             ("sky_opacity", self.render.sky_opacity),
             ("render velocity", self.render.velocity),
@@ -120,12 +144,16 @@ impl TrainOptions {
         }
         if self.stage != Stage::Pixel {
             let depth = if self.render.depth > 0.0 { "depth and sky labels" } else { "sky labels" };
-            labels.push(format!("render stage ({depth}, no flow labels)"));
+            let from = match (self.stage, self.render_from) {
+                (Stage::Both, from @ 1..) => format!(", from step {from} on"),
+                _ => String::new(),
+            };
+            labels.push(format!("render stage ({depth}, no flow labels{from})"));
         }
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
-            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera); batch {}, peak rate {:e}, schedule of {} steps",
+            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
             self.history,
             self.seed,
             c.cameras,
@@ -133,7 +161,13 @@ impl TrainOptions {
             c.width,
             c.height,
             self.one_camera_steps,
+            self.reuse,
+            if c.variety { ", varied lenses and numbers of cameras" } else { "" },
             self.batch,
+            match self.optimizer {
+                Optimizer::AdamW => "AdamW",
+                Optimizer::Muon => "Muon and AdamW",
+            },
             self.schedule.peak,
             self.schedule.steps,
         )

@@ -4,6 +4,7 @@ use candle_core::{D, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::clips::TrainClip;
+use super::groups::group_loss;
 use super::losses::{Terms, channel_last, color_loss, depth_loss, masked_mean, velocity_loss};
 use crate::config::VelocityKind;
 use crate::error::ModelError;
@@ -34,7 +35,9 @@ pub struct PixelLossOptions {
     pub velocity: f64,
     /// Mean velocity error against ground-truth flow; 0 trains without flow labels.
     pub flow: f64,
-    /// How much more a moving pixel weighs than a standing one in the flow term.
+    /// Cross-entropy of the motion weights against the tokens whose velocity is the true one; left out with `flow`.
+    pub groups: f64,
+    /// How much more a moving pixel weighs than a standing one in the flow terms.
     pub moving_weight: f64,
 }
 
@@ -50,6 +53,7 @@ impl Default for PixelLossOptions {
             sky_color: 1.0,
             velocity: 0.005,
             flow: 0.1,
+            groups: 0.05,
             moving_weight: 10.0,
         }
     }
@@ -108,6 +112,9 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
             };
         }
         add("flow", share, sum)?;
+        if options.groups > 0.0 {
+            add("groups", options.groups, group_loss(output, &truth.flow, &weights)?)?;
+        }
     }
     Ok(terms)
 }

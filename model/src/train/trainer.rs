@@ -116,12 +116,20 @@ impl Trainer {
     /// The samples of this run, batch `n` belonging to step `n`.
     pub fn data(&self) -> DataOptions {
         let o = &self.options;
-        let mut clips = o.clips;
-        if o.stage == Stage::Pixel {
-            // Nothing is drawn, so target pictures would be made for nothing.
-            clips.targets = 0;
+        // Before pictures are drawn, target pictures would be made for nothing.
+        let targets_from = match o.stage {
+            Stage::Pixel => u64::MAX,
+            Stage::Render => 0,
+            Stage::Both => o.render_from,
+        };
+        DataOptions {
+            seed: o.seed,
+            batch: o.batch,
+            clips: o.clips,
+            one_camera_batches: o.one_camera_steps,
+            targets_from,
+            reuse: o.reuse,
         }
-        DataOptions { seed: o.seed, batch: o.batch, clips, one_camera_batches: o.one_camera_steps }
     }
 
     pub(super) fn parts(&self) -> (&[Slot], &Tensors) {
@@ -183,8 +191,9 @@ impl Trainer {
         let backward_sec = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let learning_rate = self.options.schedule.at(self.step);
-        let (decay, adam) = (self.options.average_decay, self.options.adam);
-        let gradient_norm = adamw::step(&mut self.slots, &gradients, self.step, learning_rate, decay, &adam);
+        let TrainOptions { average_decay: decay, adam, optimizer, .. } = self.options;
+        let gradient_norm =
+            adamw::step(&mut self.slots, &gradients, self.step, learning_rate, decay, optimizer, &adam)?;
         for (var, slot) in self.vars.iter().zip(&self.slots) {
             let bad = slot.weight.iter().filter(|x| !x.is_finite()).count();
             if bad > 0 {
@@ -205,7 +214,7 @@ impl Trainer {
     }
 
     fn losses(&self, output: &crate::ClipOutput, clip: &TrainClip) -> Result<Terms, ModelError> {
-        match self.options.stage {
+        match self.options.stage_at(self.step) {
             Stage::Pixel => pixel_losses(output, clip, &self.options.pixel),
             Stage::Render => render_stage_losses(output, clip, &self.renderer, &self.options.render, self.step),
             Stage::Both => {

@@ -11,7 +11,7 @@ use storm_model::train::{StepReport, Validation};
 use crate::output::atomic::write_bytes;
 
 /// Every loss term there is; those a run does not have stay empty.
-const TERMS: [&str; 16] = [
+const TERMS: [&str; 17] = [
     "rgb",
     "log_depth",
     "depth",
@@ -22,6 +22,7 @@ const TERMS: [&str; 16] = [
     "sky_color",
     "velocity",
     "flow",
+    "groups",
     "structure",
     "sky_opacity",
     "sky_depth",
