@@ -37,10 +37,10 @@ pub struct Args {
     /// Configuration file, for the bag's topics and windows.
     #[arg(long, requires = "bag")]
     config: Option<PathBuf>,
-    /// Weights: .safetensors, or a PyTorch .pth/.pt checkpoint.
-    #[arg(long, default_value = "")]
+    /// Weights: .safetensors, or a PyTorch .pth/.pt checkpoint [default: those that ship].
+    #[arg(long, default_value = "", hide_default_value = true)]
     weights: String,
-    /// Architecture when there is no weights file [default: tiny].
+    /// Architecture when no weights are named [default: tiny].
     #[arg(long)]
     preset: Option<String>,
     /// What to compare, by the names of the table: a list, `cheap` or `all`. gs3d, gs3d_init and nsfp take minutes per clip.
