@@ -4,6 +4,7 @@
 //! tracks hanging off the step result. Stages are plain values in, plain values out, without threads or clocks.
 
 pub mod bag;
+pub mod baselines;
 pub mod cdr;
 pub mod cmd;
 pub mod config;

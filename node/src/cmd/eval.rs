@@ -1,16 +1,17 @@
-//! `storm eval`: error figures on drives that training never saw.
+//! `storm eval`: error figures on drives that training never saw, or on a bag, beside baselines and ceilings.
 
-use std::path::PathBuf;
+mod table;
+
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use serde_json::json;
-use storm_render::raster::CpuRasterizer;
+use serde_json::{Value, json};
 
 use super::{Outcome, UsageError, progress_bar};
-use crate::config::ModelConfigSection;
-use crate::engine::evaluate::{Clip, Evaluation, HELD_OUT_SEEDS};
-use crate::engine::score::Figures;
-use crate::engine::{Engine, ModelSource};
+use crate::config::{Config, ModelConfigSection};
+use crate::engine::evaluate::bag::{BagClips, Part};
+use crate::engine::evaluate::{Clip, Effort, Evaluation, HELD_OUT_SEEDS, Method};
+use crate::engine::{Engine, ModelSource, UNTRAINED};
 
 /// Arguments of `storm eval`.
 #[derive(Debug, clap::Args)]
@@ -19,17 +20,44 @@ pub struct Args {
     #[arg(long, default_value = "held-out", value_parser = ["held-out"])]
     suite: String,
     /// Other seeds: A..B, B not included.
-    #[arg(long, value_parser = parse_seeds)]
+    #[arg(long, value_parser = parse_seeds, conflicts_with = "bag")]
     seeds: Option<std::ops::Range<u64>>,
-    /// Weights: .safetensors, or a PyTorch .pth/.pt checkpoint.
-    #[arg(long, default_value = "")]
+    /// Clips of a recording instead: pictures always, depth, flow and masks where it has ground-truth topics.
+    #[arg(long)]
+    bag: Option<PathBuf>,
+    /// Clips cut from the bag, spread evenly (they overlap where it is short).
+    #[arg(long, default_value_t = 10, requires = "bag")]
+    clips: usize,
+    /// Use the bag from here on, seconds after its first synchronized set.
+    #[arg(long, default_value_t = 0.0, requires = "bag")]
+    from_sec: f64,
+    /// Use the bag up to here, seconds after its first synchronized set.
+    #[arg(long, requires = "bag")]
+    to_sec: Option<f64>,
+    /// Configuration file, for the bag's topics and windows.
+    #[arg(long, requires = "bag")]
+    config: Option<PathBuf>,
+    /// Weights: .safetensors, or a PyTorch .pth/.pt checkpoint [default: those that ship].
+    #[arg(long, default_value = "", hide_default_value = true)]
     weights: String,
-    /// Architecture when there is no weights file.
-    #[arg(long, default_value = "tiny")]
-    preset: String,
+    /// Architecture when no weights are named [default: tiny].
+    #[arg(long)]
+    preset: Option<String>,
+    /// What to compare, by the names of the table: a list, `cheap` or `all`. gs3d, gs3d_init and nsfp take minutes per clip.
+    #[arg(long, default_value = "cheap", value_parser = Method::parse_list)]
+    methods: std::vec::Vec<Method>,
+    /// Weights trained without motion, one timestep at a time, for the method per_frame [default: the same weights].
+    #[arg(long)]
+    per_frame_weights: Option<PathBuf>,
+    /// Iterations of the per-scene optimisation gs3d.
+    #[arg(long, default_value_t = Effort::default().gs3d_iterations)]
+    gs3d_iterations: u64,
     /// Write the figures as JSON.
     #[arg(long)]
     json: Option<PathBuf>,
+    /// Write the table as Markdown.
+    #[arg(long)]
+    markdown: Option<PathBuf>,
 }
 
 fn parse_seeds(text: &str) -> Result<std::ops::Range<u64>, String> {
@@ -41,66 +69,168 @@ fn parse_seeds(text: &str) -> Result<std::ops::Range<u64>, String> {
     }
 }
 
-/// Scores the network and its baselines, prints the table.
+/// Scores the network and what it is compared with, prints the table.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
-    let section = ModelConfigSection {
-        weights: args.weights.clone(),
-        preset: args.preset.clone(),
-        ..ModelConfigSection::default()
+    let mut config = match &args.config {
+        Some(path) => Config::load(path)?,
+        None => Config::default(),
     };
-    let source = ModelSource::open(&section)?;
-    let size = source.picture_size(&section)?;
-    if source.config().num_cams < 3 && source.config().use_affine_token {
-        return Err(UsageError("these weights are for fewer than the suite's 3 cameras".into()).into());
+    if !args.weights.is_empty() {
+        config.model.weights = args.weights.clone();
     }
-    let timespan_sec = crate::config::WindowConfig::default().timespan_sec;
-    let mut engine = Engine::new(source, &section, 3, timespan_sec)?;
-    let mut raster = CpuRasterizer::new(engine.raster_settings())?;
-    let seeds = args.seeds.clone().unwrap_or(HELD_OUT_SEEDS);
-    let bar = progress_bar(progress, seeds.end - seeds.start, "scoring clips");
-    let mut evaluation = Evaluation::default();
-    for seed in seeds.clone() {
-        evaluation
-            .add(&Clip::of_seed(seed, size)?, &mut engine, &mut raster)
-            .with_context(|| format!("seed {seed}"))?;
+    if let Some(preset) = &args.preset {
+        config.model.preset = preset.clone();
+    }
+    config.validate()?;
+    let source = ModelSource::open(&config.model)?;
+    let size = source.picture_size(&config.model)?;
+    let data = Data::open(args, &config, size)?;
+    let cameras = data.cameras();
+    check_cameras(&source, cameras)?;
+    let timespan_sec = config.window.timespan_sec;
+    let engine = Engine::new(source, &config.model, cameras, timespan_sec)?;
+    let per_frame = args.per_frame_weights.as_deref().map(|path| {
+        let section = ModelConfigSection { weights: path.display().to_string(), ..config.model.clone() };
+        let source = ModelSource::open(&section)?;
+        check_cameras(&source, cameras)?;
+        if source.picture_size(&section)? != size {
+            let text = format!("--per-frame-weights {} are not for {}x{} pixels", path.display(), size.0, size.1);
+            return Err(UsageError(text).into());
+        }
+        Engine::new(source, &section, cameras, timespan_sec)
+    });
+    let effort = Effort { gs3d_iterations: args.gs3d_iterations, ..Effort::default() };
+    let mut evaluation = Evaluation::new(engine, per_frame.transpose()?, &args.methods, effort);
+
+    let bar = progress_bar(progress, (data.count() * args.methods.len()) as u64, "scoring");
+    data.each(size, |clip| {
+        let mut at = None;
+        let result = evaluation.add(&clip, &mut |method, steps| {
+            if at != Some(method) {
+                bar.inc(u64::from(at.is_some()));
+                at = Some(method);
+            }
+            let steps = steps.map_or(String::new(), |(done, all)| format!(" {done}/{all}"));
+            bar.set_message(format!("{}: {}{steps}", clip.name, method.name()));
+        });
         bar.inc(1);
-    }
+        result
+    })?;
     bar.finish_and_clear();
-    let methods = [
-        ("storm", evaluation.storm.figures()),
-        ("static", evaluation.still.figures()),
-        ("nearest_context", evaluation.nearest_context.figures()),
-    ];
-    println!("weights: {}; seeds {}..{}; {}x{} pixels", engine.weights(), seeds.start, seeds.end, size.0, size.1);
-    print_table(&methods);
+
+    let weights = evaluation.engine().weights().to_string();
+    let figures = evaluation.figures();
+    let named: Vec<(&str, _)> = figures.iter().map(|(method, figures)| (method.name(), figures)).collect();
+    if weights == UNTRAINED {
+        eprintln!("weights: untrained. Seeded random weights stand in; the network's figures mean nothing");
+    }
+    println!(
+        "weights: {weights}; {}; {} held-out pictures of {}x{} pixels",
+        data.describe(),
+        evaluation.images(),
+        size.0,
+        size.1
+    );
+    print!("{}", table::text(&named));
+    if let Some(path) = &args.markdown {
+        write(path, &table::markdown(&named))?;
+    }
     if let Some(path) = &args.json {
-        let mut report =
-            json!({"weights": engine.weights(), "seeds": [seeds.start, seeds.end], "picture": [size.0, size.1]});
-        for (name, figures) in &methods {
+        let mut report = json!({
+            "weights": weights,
+            "picture": [size.0, size.1],
+            "images": evaluation.images(),
+            "clips": data.count(),
+            "gs3d_iterations": args.gs3d_iterations,
+        });
+        data.note(&mut report);
+        for (name, figures) in &named {
             report[*name] = serde_json::to_value(figures)?;
         }
-        std::fs::write(path, serde_json::to_string_pretty(&report)? + "\n")
-            .with_context(|| format!("cannot write {}", path.display()))?;
+        write(path, &(serde_json::to_string_pretty(&report)? + "\n"))?;
     }
     Ok(Outcome::Done)
 }
 
-fn print_table(methods: &[(&str, Figures)]) {
-    print!("{:24}", "");
-    methods.iter().for_each(|(name, _)| print!("{name:>18}"));
-    println!();
-    let rows = methods.first().map_or(0, |(_, f)| f.rows().len());
-    for row in 0..rows {
-        for (i, (_, figures)) in methods.iter().enumerate() {
-            let (name, unit, value) = figures.rows()[row];
-            if i == 0 {
-                print!("{:24}", if unit.is_empty() { name.to_string() } else { format!("{name}, {unit}") });
+fn write(path: &Path, text: &str) -> Result<()> {
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn check_cameras(source: &ModelSource, cameras: usize) -> Result<()> {
+    let most = source.config().num_cams;
+    let untrained = matches!(source, ModelSource::Untrained { .. });
+    if untrained || most >= cameras || !source.config().use_affine_token {
+        return Ok(());
+    }
+    Err(UsageError(format!("these weights are for at most {most} cameras; there are {cameras}")).into())
+}
+
+/// Where clips come from.
+enum Data {
+    Drives(std::ops::Range<u64>),
+    Bag { clips: Box<BagClips>, name: String, part: Part },
+}
+
+impl Data {
+    fn open(args: &Args, config: &Config, size: (usize, usize)) -> Result<Self> {
+        let Some(path) = &args.bag else { return Ok(Self::Drives(args.seeds.clone().unwrap_or(HELD_OUT_SEEDS))) };
+        let part = Part { from_sec: args.from_sec, to_sec: args.to_sec.unwrap_or(f64::INFINITY), clips: args.clips };
+        if !(part.from_sec >= 0.0 && part.to_sec > part.from_sec && part.clips > 0) {
+            let text = format!(
+                "--from-sec {}, --to-sec {}, --clips {}: give 0 <= from < to and at least one clip",
+                part.from_sec, part.to_sec, part.clips
+            );
+            return Err(UsageError(text).into());
+        }
+        let clips = Box::new(BagClips::open(path, config, size, &part)?);
+        let name = path.file_name().map_or_else(|| "bag".into(), |n| n.to_string_lossy().into_owned());
+        Ok(Self::Bag { clips, name, part })
+    }
+
+    fn cameras(&self) -> usize {
+        match self {
+            Self::Drives(_) => 3,
+            Self::Bag { clips, .. } => clips.rig().cameras.len(),
+        }
+    }
+
+    fn count(&self) -> usize {
+        match self {
+            Self::Drives(seeds) => usize::try_from(seeds.end - seeds.start).unwrap_or(usize::MAX),
+            Self::Bag { clips, .. } => clips.count(),
+        }
+    }
+
+    fn each(&self, size: (usize, usize), mut each: impl FnMut(Clip) -> Result<()>) -> Result<()> {
+        match self {
+            Self::Drives(seeds) => {
+                for seed in seeds.clone() {
+                    each(Clip::of_seed(seed, size).with_context(|| format!("seed {seed}"))?)?;
+                }
+                Ok(())
             }
-            match value {
-                Some(x) => print!("{x:>18.3}"),
-                None => print!("{:>18}", "-"),
+            Self::Bag { clips, .. } => clips.each(each),
+        }
+    }
+
+    fn describe(&self) -> String {
+        match self {
+            Self::Drives(seeds) => format!("seeds {}..{}", seeds.start, seeds.end),
+            Self::Bag { clips, name, part } => {
+                let to = if part.to_sec.is_finite() { format!("{} s", part.to_sec) } else { "the end".into() };
+                format!("{} clips of {name}, from {} s to {to}", clips.count(), part.from_sec)
             }
         }
-        println!();
+    }
+
+    fn note(&self, report: &mut Value) {
+        match self {
+            Self::Drives(seeds) => report["seeds"] = json!([seeds.start, seeds.end]),
+            Self::Bag { name, part, .. } => {
+                report["bag"] = json!(name);
+                report["from_sec"] = json!(part.from_sec);
+                report["to_sec"] = json!(part.to_sec.is_finite().then_some(part.to_sec));
+            }
+        }
     }
 }

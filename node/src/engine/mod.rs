@@ -1,8 +1,10 @@
 //! One window in, one scene out: the network and the renderer behind plain values.
 
 pub mod evaluate;
+pub mod figures;
 pub mod score;
 pub mod select;
+pub mod truth;
 
 use std::path::Path;
 

@@ -7,53 +7,23 @@ use std::sync::Arc;
 use anyhow::Result;
 use serde::Serialize;
 use storm_model::metrics::flow::{FlowEvaluation, FlowFrame};
-use storm_model::metrics::image::{Held, Image, ImageScores};
+use storm_model::metrics::image::ImageScores;
 use storm_model::scene::Want;
 use storm_render::Intrinsics;
 use storm_render::raster::{CpuRasterizer, RasterSettings};
-use storm_render::world::WorldFrame;
 
 use crate::engine::views_of;
 use crate::pipeline::front::TruthImage;
 use crate::pipeline::step::Step;
 use crate::source::Frame;
-use crate::source::event::Truth;
 use crate::source::topics::TruthKind;
 use crate::window::PosedSet;
 
+use super::figures::Figures;
+use super::truth::{TruthAt, unit};
+
 /// Sets and ground truth are kept this long beyond the oldest window that still waits to be scored, seconds.
 const KEEP_SEC: f64 = 2.0;
-
-/// Figures of one method; `None` where nothing could be compared. Definitions: `storm_model::metrics`.
-#[derive(Debug, Clone, Default, Serialize, PartialEq)]
-pub struct Figures {
-    /// dB, mean over images, without sky where the sky is known.
-    pub psnr: Option<f64>,
-    /// dB, moving pixels only.
-    pub psnr_dynamic: Option<f64>,
-    /// Structural similarity, without sky where the sky is known.
-    pub ssim: Option<f64>,
-    /// Structural similarity, moving pixels only.
-    pub ssim_dynamic: Option<f64>,
-    /// z-depth, metres.
-    pub depth_rmse: Option<f64>,
-    /// z-depth of moving pixels, metres.
-    pub depth_rmse_dynamic: Option<f64>,
-    /// End-point error of the flow on the newest context frames, m/s.
-    pub epe3d: Option<f64>,
-    /// Share of points within 0.05 m/s or 5 %, 0 to 1.
-    pub acc5: Option<f64>,
-    /// Share of points within 0.1 m/s or 10 %, 0 to 1.
-    pub acc10: Option<f64>,
-    /// Mean angle between true and predicted flow of moving points, radians.
-    pub theta: Option<f64>,
-    /// Foreground adjusted Rand index of the motion masks on context frames.
-    pub fg_ari: Option<f64>,
-    /// Intersection over union of moving pixels on context frames, 0 to 1.
-    pub moving_iou: Option<f64>,
-    /// Milliseconds per window.
-    pub ms: Option<f64>,
-}
 
 /// Error figures of a run.
 #[derive(Debug, Clone, Serialize, PartialEq)]
@@ -87,79 +57,6 @@ impl Scores {
             text(self.storm.depth_rmse),
             text(self.storm.epe3d),
         )
-    }
-}
-
-impl Figures {
-    /// Name, unit and value of each.
-    pub fn rows(&self) -> [(&'static str, &'static str, Option<f64>); 13] {
-        [
-            ("PSNR", "dB", self.psnr),
-            ("PSNR, moving", "dB", self.psnr_dynamic),
-            ("SSIM", "", self.ssim),
-            ("SSIM, moving", "", self.ssim_dynamic),
-            ("depth RMSE", "m", self.depth_rmse),
-            ("depth RMSE, moving", "m", self.depth_rmse_dynamic),
-            ("EPE3D", "m/s", self.epe3d),
-            ("Acc5", "", self.acc5),
-            ("Acc10", "", self.acc10),
-            ("angle", "rad", self.theta),
-            ("foreground ARI", "", self.fg_ari),
-            ("moving IoU", "", self.moving_iou),
-            ("run time", "ms", self.ms),
-        ]
-    }
-
-    /// Means over images, without sky where the sky is known.
-    pub(super) fn of_images(scores: &[ImageScores]) -> Self {
-        let m = ImageScores::mean(scores);
-        Self {
-            psnr: m.psnr_occupied.or(m.psnr),
-            psnr_dynamic: m.psnr_dynamic,
-            ssim: m.ssim_occupied.or(m.ssim),
-            ssim_dynamic: m.ssim_dynamic,
-            depth_rmse: m.depth_rmse,
-            depth_rmse_dynamic: m.depth_rmse_dynamic,
-            ..Self::default()
-        }
-    }
-}
-
-/// Ground truth of one picture, at the picture's size.
-pub(super) struct TruthAt {
-    size: (usize, usize),
-    depth: Option<Vec<f32>>,
-    flow: Option<Vec<[f32; 3]>>,
-    moving: Option<Vec<u16>>,
-    sky: Option<Vec<u16>>,
-}
-
-impl TruthAt {
-    /// Of a drawn frame, at its own size.
-    pub(super) fn of_frame(frame: &WorldFrame) -> Self {
-        let mask = |m: &[u8]| Some(m.iter().map(|&x| u16::from(x)).collect());
-        Self {
-            size: (frame.width, frame.height),
-            depth: Some(frame.depth.clone()),
-            flow: None,
-            moving: mask(&frame.moving),
-            sky: mask(&frame.sky),
-        }
-    }
-
-    /// Scores of a picture against what the camera saw; `depth` is the prediction, where the method has one.
-    pub(super) fn compare(&self, pred01: &[f32], true01: &[f32], depth: Option<&[f32]>) -> Result<ImageScores> {
-        let image = |values| Image { values, width: self.size.0, height: self.size.1, channels: 3 };
-        let flags = |mask: &Option<Vec<u16>>| mask.as_ref().map(|m| m.iter().map(|&x| x != 0).collect::<Vec<bool>>());
-        let (sky, dynamic) = (flags(&self.sky), flags(&self.moving));
-        let held = Held {
-            pred: image(pred01),
-            truth: image(true01),
-            depth: depth.zip(self.depth.as_deref()),
-            sky: sky.as_deref(),
-            dynamic: dynamic.as_deref(),
-        };
-        Ok(held.scores()?)
     }
 }
 
@@ -296,14 +193,10 @@ impl Scorer {
 
     /// Ground truth at `size`, sampled at pixel centres.
     fn truth_at(&self, camera: usize, stamp_ns: i64, size: (usize, usize)) -> TruthAt {
-        let mut at = TruthAt { size, depth: None, flow: None, moving: None, sky: None };
-        for kind in [TruthKind::Depth, TruthKind::Flow, TruthKind::Moving, TruthKind::Sky] {
-            let Some(image) = self.truth.get(&(stamp_ns, camera, kind)) else { continue };
-            match (&*image.data, kind) {
-                (Truth::Depth(d), _) => at.depth = sample(d, image, size),
-                (Truth::Flow(f), _) => at.flow = sample(f, image, size),
-                (Truth::Mask(m), TruthKind::Moving) => at.moving = sample(m, image, size),
-                (Truth::Mask(m), _) => at.sky = sample(m, image, size),
+        let mut at = TruthAt::none(size);
+        for kind in TruthKind::ALL {
+            if let Some(image) = self.truth.get(&(stamp_ns, camera, kind)) {
+                at.set(kind, image);
             }
         }
         at
@@ -322,32 +215,4 @@ fn spread(sets: &[Arc<PosedSet<Frame>>], limit: usize, step: u64) -> impl Iterat
 fn nearest_context(step: &Step, camera: usize, stamp_ns: i64) -> Option<&[u8]> {
     let frames = step.window.steps.iter().filter_map(|s| s.frames.get(camera));
     frames.min_by_key(|f| f.stamp_ns.abs_diff(stamp_ns)).map(|f| f.item.rgb.data.as_slice())
-}
-
-/// 8-bit values as 0 to 1.
-pub(super) fn unit(bytes: &[u8]) -> Vec<f32> {
-    bytes.iter().map(|&b| b as f32 / 255.0).collect()
-}
-
-/// `data` at the centres of a `width x height` picture's pixels; `None` when its length does not fit its size.
-fn sample<T: Copy>(data: &[T], image: &TruthImage, (width, height): (usize, usize)) -> Option<Vec<T>> {
-    if data.len() != image.width * image.height || data.is_empty() {
-        return None;
-    }
-    let at = |i: usize, from: usize, to: usize| ((2 * i + 1) * from / (2 * to)).min(from - 1);
-    let pixel = |k: usize| data[at(k / width, image.height, height) * image.width + at(k % width, image.width, width)];
-    Some((0..width * height).map(pixel).collect())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn truth_is_sampled_at_pixel_centres() {
-        let image = TruthImage { width: 4, height: 2, data: Arc::new(Truth::Mask(Vec::new())) };
-        assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (2, 1)), Some(vec![5, 7]));
-        assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (4, 2)), Some(vec![0, 1, 2, 3, 4, 5, 6, 7]));
-        assert_eq!(sample(&[0, 1], &image, (4, 2)), None);
-    }
 }

@@ -218,7 +218,7 @@ fn truth(kind: TruthKind, data: &[u8]) -> Result<TruthImage> {
     let data = match kind {
         TruthKind::Depth => Truth::Depth(decode::image_to_depth(&image)?.data),
         TruthKind::Flow => Truth::Flow(decode::image_to_vectors(&image)?),
-        TruthKind::Moving | TruthKind::Sky => Truth::Mask(decode::image_to_labels(&image)?),
+        TruthKind::Moving | TruthKind::Sky | TruthKind::Instance => Truth::Mask(decode::image_to_labels(&image)?),
     };
     Ok(TruthImage { stamp_ns: image.header.stamp_ns, width, height, data })
 }

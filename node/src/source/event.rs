@@ -23,7 +23,7 @@ pub enum Truth {
     Depth(Vec<f32>),
     /// Scene flow, m/s in map axes.
     Flow(Vec<[f32; 3]>),
-    /// Not 0 where the surface moves, or where the sky is, by kind.
+    /// Not 0 where the surface moves, or where the sky is, or the object's number, by kind.
     Mask(Vec<u16>),
 }
 

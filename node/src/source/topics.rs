@@ -101,6 +101,13 @@ pub enum TruthKind {
     Moving,
     /// Not 0 where the ray meets the sky.
     Sky,
+    /// Object number, 0 for the static scene.
+    Instance,
+}
+
+impl TruthKind {
+    /// Every kind.
+    pub const ALL: [Self; 5] = [Self::Depth, Self::Flow, Self::Moving, Self::Sky, Self::Instance];
 }
 
 /// The recording's topics by part.
@@ -269,7 +276,7 @@ fn find_pose(topics: &[Topic], config: &InputConfig, has_tf: bool) -> Result<Pos
     }
 }
 
-/// Ground truth of camera i is below `<prefix>/<the camera's own namespace>/{depth,flow,moving,sky}`.
+/// Ground truth of camera i is below `<prefix>/<the camera's own namespace>/{depth,flow,moving,sky,instance}`.
 fn find_truth(topics: &[Topic], config: &InputConfig, cameras: &[CameraTopics]) -> Vec<(usize, TruthKind, usize)> {
     let mut truth = Vec::new();
     for (camera, c) in cameras.iter().enumerate() {
@@ -279,6 +286,7 @@ fn find_truth(topics: &[Topic], config: &InputConfig, cameras: &[CameraTopics]) 
             (TruthKind::Flow, "flow"),
             (TruthKind::Moving, "moving"),
             (TruthKind::Sky, "sky"),
+            (TruthKind::Instance, "instance"),
         ];
         for (kind, last) in kinds {
             let name = format!("{}{dir}/{last}", config.truth_prefix);

@@ -1,0 +1,266 @@
+//! Scores of one method over many clips.
+
+use anyhow::Result;
+use glam::Vec3;
+use storm_model::metrics::Mean;
+use storm_model::metrics::flow::{AV2_DYNAMIC_MPS, Flow, FlowEvaluation, FlowFrame, three_way_epe};
+use storm_model::metrics::image::ImageScores;
+use storm_model::metrics::mask::{foreground_ari, iou};
+use storm_model::scene::{RenderedView, Want};
+use storm_render::View;
+use storm_render::raster::CpuRasterizer;
+
+use super::clip::unproject;
+use super::tracks::{StepCloud, apd3d};
+use super::{Clip, ClipFrame, Placed, Prediction};
+use crate::engine::figures::Figures;
+use crate::engine::select::{MOVING_MPS, SURFACE_OPACITY};
+use crate::engine::truth::{TruthAt, unit};
+use crate::engine::views_of;
+use crate::pipeline::sink::motion_mask;
+use crate::window::relative;
+
+/// Scores of one method over many clips.
+#[derive(Default)]
+pub struct Tally {
+    images: Vec<ImageScores>,
+    flow: FlowEvaluation,
+    /// Moving foreground, still foreground, background: means of the timesteps.
+    three_way: [Mean; 3],
+    ari: Mean,
+    moving_iou: Mean,
+    apd3d: Mean,
+    ms: Mean,
+}
+
+/// One context timestep, all cameras pooled; only cameras whose depth and flow are known.
+#[derive(Default)]
+struct StepFlow {
+    pred: Vec<Flow>,
+    truth: Vec<Flow>,
+    depth: Vec<f32>,
+    foreground: Vec<bool>,
+}
+
+/// Motion masks of one context timestep, all cameras pooled; only cameras whose truth is known.
+#[derive(Default)]
+struct StepMask {
+    groups: Vec<u32>,
+    true_groups: Vec<u32>,
+    moves: Vec<bool>,
+    truly_moves: Vec<bool>,
+}
+
+impl Tally {
+    /// Means over everything scored.
+    pub fn figures(&self) -> Figures {
+        let flow = self.flow.means();
+        let mut mean = Mean::default();
+        self.three_way.iter().for_each(|kind| mean.add(kind.value()));
+        let [dynamic, still, background] = self.three_way.map(|kind| kind.value());
+        Figures {
+            epe3d: flow.epe3d,
+            acc5: flow.acc5,
+            acc10: flow.acc10,
+            theta: flow.theta,
+            epe3d_three_way: mean.value(),
+            epe3d_foreground_dynamic: dynamic,
+            epe3d_foreground_static: still,
+            epe3d_background_static: background,
+            fg_ari: self.ari.value(),
+            moving_iou: self.moving_iou.value(),
+            apd3d: self.apd3d.value(),
+            ms: self.ms.value(),
+            ..Figures::of_images(&self.images)
+        }
+    }
+
+    /// Held-out pictures scored.
+    pub fn images(&self) -> usize {
+        self.images.len()
+    }
+
+    /// Adds a method's answer for one clip, and how long it took.
+    pub fn add(&mut self, clip: &Clip, prediction: &Prediction, ms: Option<f64>) -> Result<()> {
+        self.ms.add(ms);
+        match prediction {
+            Prediction::Scenes(scenes) => self.scenes(clip, scenes),
+            Prediction::Flow(flow) => self.flow_only(clip, flow),
+            Prediction::NearestContext => self.nearest(clip),
+        }
+    }
+
+    /// Held-out frames drawn, then flow, masks and trajectories of the context frames.
+    fn scenes(&mut self, clip: &Clip, scenes: &[Placed]) -> Result<()> {
+        let Some(first) = scenes.first() else { return Ok(()) };
+        let mut raster = CpuRasterizer::new(first.scene.raster_settings())?;
+        let mut flows = Vec::new();
+        let mut clouds = Vec::new();
+        for frame in &clip.frames {
+            let nearest = scenes.iter().min_by_key(|s| s.stamp_ns.abs_diff(frame.set.stamp_ns));
+            let Some(placed) = nearest else { continue };
+            let views = draw(placed, clip, frame, &mut raster)?;
+            let Some(step) = frame.context else {
+                for ((view, truth), seen) in views.iter().zip(&frame.truth).zip(&frame.set.frames) {
+                    let true01 = unit(&seen.item.rgb.data);
+                    self.images.push(truth.compare(&unit(&view.rgb8()), &true01, Some(&view.depth))?);
+                }
+                continue;
+            };
+            let map_from_anchor = placed.map_from_anchor.rotation.as_quat();
+            let (mut flow, mut mask) = (StepFlow::default(), StepMask::default());
+            for (view, truth) in views.iter().zip(&frame.truth) {
+                let pred: Vec<Flow> =
+                    view.flow.iter().flatten().map(|&f| (map_from_anchor * Vec3::from(f)).to_array()).collect();
+                flow.add(truth, &pred);
+                let groups: Vec<u32> = motion_mask(view).into_iter().map(u32::from).collect();
+                mask.add(truth, groups.iter().map(|&g| g != 0), Some(&groups));
+            }
+            flows.push(flow);
+            self.mask(&mask)?;
+            // A single scene of all timesteps, or one scene per timestep.
+            let part = if placed.scene.shape.timesteps == clip.window.steps.len() { step } else { 0 };
+            clouds.push(match placed.pixel_aligned {
+                true => gaussian_cloud(clip, placed, part),
+                false => drawn_cloud(clip, step, &views),
+            });
+        }
+        self.flows(&flows)?;
+        self.apd3d.add(apd3d(clip, &clouds)?);
+        Ok(())
+    }
+
+    /// Flow given for every context pixel, on true geometry.
+    fn flow_only(&mut self, clip: &Clip, flow: &[Vec<Vec<Flow>>]) -> Result<()> {
+        let anchor_from_map = clip.window.map_from_anchor.rotation.as_quat().conjugate();
+        let mut flows = Vec::new();
+        let mut clouds = Vec::new();
+        for (step, frame) in clip.context() {
+            let (mut pooled, mut mask, mut cloud) = (StepFlow::default(), StepMask::default(), StepCloud::default());
+            for (camera, (view, truth)) in clip.views(step).iter().zip(&frame.truth).enumerate() {
+                let Some(pred) = flow.get(step).and_then(|cameras| cameras.get(camera)) else { continue };
+                pooled.add(truth, pred);
+                mask.add(truth, pred.iter().map(|&f| Vec3::from(f).length() >= MOVING_MPS), None);
+                let Some(depth) = &truth.depth else { continue };
+                for (i, (&z, &f)) in depth.iter().zip(pred).enumerate() {
+                    let v = anchor_from_map * Vec3::from(f);
+                    cloud.push(unproject(view, i, z), v, v, z > 0.0);
+                }
+            }
+            flows.push(pooled);
+            self.mask(&mask)?;
+            clouds.push(cloud);
+        }
+        self.flows(&flows)?;
+        self.apd3d.add(apd3d(clip, &clouds)?);
+        Ok(())
+    }
+
+    /// Held-out frames answered with the nearest context picture of the same camera.
+    fn nearest(&mut self, clip: &Clip) -> Result<()> {
+        for frame in clip.frames.iter().filter(|f| f.context.is_none()) {
+            for (camera, (seen, truth)) in frame.set.frames.iter().zip(&frame.truth).enumerate() {
+                let context = clip.window.steps.iter().filter_map(|s| s.frames.get(camera));
+                let Some(nearest) = context.min_by_key(|f| f.stamp_ns.abs_diff(seen.stamp_ns)) else { continue };
+                let (pred, true01) = (unit(&nearest.item.rgb.data), unit(&seen.item.rgb.data));
+                self.images.push(truth.compare(&pred, &true01, None)?);
+            }
+        }
+        Ok(())
+    }
+
+    /// The context timesteps of one clip are one sample, as in the paper's program.
+    fn flows(&mut self, flows: &[StepFlow]) -> Result<()> {
+        let known: Vec<&StepFlow> = flows.iter().filter(|f| !f.truth.is_empty()).collect();
+        let frame = |f: &&StepFlow| -> Vec<bool> { f.depth.iter().map(|&d| d > 0.0).collect() };
+        for f in &known {
+            if f.foreground.len() == f.truth.len() {
+                let kinds = three_way_epe(&f.pred, &f.truth, &f.foreground, Some(&frame(f)), AV2_DYNAMIC_MPS)?;
+                let values = [kinds.foreground_dynamic, kinds.foreground_static, kinds.background_static];
+                self.three_way.iter_mut().zip(values).for_each(|(mean, value)| mean.add(value));
+            }
+        }
+        let frames: Vec<FlowFrame> =
+            known.iter().map(|f| FlowFrame { pred: &f.pred, truth: &f.truth, depth: &f.depth, ground: None }).collect();
+        Ok(self.flow.add(&frames)?)
+    }
+
+    fn mask(&mut self, mask: &StepMask) -> Result<()> {
+        if mask.groups.len() == mask.true_groups.len() {
+            self.ari.add(foreground_ari(&mask.groups, &mask.true_groups, 0)?);
+        }
+        self.moving_iou.add(iou(&mask.moves, &mask.truly_moves, None)?);
+        Ok(())
+    }
+}
+
+impl StepFlow {
+    fn add(&mut self, truth: &TruthAt, pred: &[Flow]) {
+        let (Some(flow), Some(depth)) = (&truth.flow, &truth.depth) else { return };
+        if flow.len() != pred.len() {
+            return;
+        }
+        self.pred.extend_from_slice(pred);
+        self.truth.extend_from_slice(flow);
+        self.depth.extend_from_slice(depth);
+        self.foreground.extend(truth.instance.iter().flatten().map(|&id| id != 0));
+    }
+}
+
+impl StepMask {
+    fn add(&mut self, truth: &TruthAt, moves: impl Iterator<Item = bool>, groups: Option<&[u32]>) {
+        let Some(moving) = &truth.moving else { return };
+        self.moves.extend(moves);
+        self.truly_moves.extend(moving.iter().map(|&m| m != 0));
+        if let (Some(groups), Some(instance)) = (groups, &truth.instance) {
+            self.groups.extend_from_slice(groups);
+            let group = |(&id, &m): (&u16, &u16)| if m != 0 { u32::from(id) } else { 0 };
+            self.true_groups.extend(instance.iter().zip(moving).map(group));
+        }
+    }
+}
+
+/// All cameras of a frame, each at its own stamp.
+fn draw(placed: &Placed, clip: &Clip, frame: &ClipFrame, raster: &mut CpuRasterizer) -> Result<Vec<RenderedView>> {
+    let context = frame.context.is_some();
+    let want = Want { flow: context, motion: context };
+    let targets = views_of(&frame.set, &placed.map_from_anchor, &clip.cameras);
+    let stamps: Vec<i64> = frame.set.frames.iter().map(|f| f.stamp_ns).collect();
+    if stamps.windows(2).all(|pair| pair[0] == pair[1]) {
+        let stamp_ns = stamps.first().copied().unwrap_or(frame.set.stamp_ns);
+        return Ok(placed.scene.render(raster, &targets, clip.time_sec(stamp_ns), want)?);
+    }
+    let mut views = Vec::new();
+    for (target, stamp_ns) in targets.into_iter().zip(stamps) {
+        views.extend(placed.scene.render(raster, &[target], clip.time_sec(stamp_ns), want)?);
+    }
+    Ok(views)
+}
+
+/// The Gaussians of one timestep, `part` of the scene, in the window's frame.
+fn gaussian_cloud(clip: &Clip, placed: &Placed, part: usize) -> StepCloud {
+    let pose = relative(&clip.window.map_from_anchor, &placed.map_from_anchor).to_f32();
+    let g = &placed.scene.gaussians;
+    let mut cloud = StepCloud::default();
+    for camera in 0..clip.cameras.len() {
+        for i in placed.scene.shape.picture(part, camera) {
+            let turned = |v: [f32; 3]| pose.transform_vector3(Vec3::from(v));
+            let place = pose.transform_point3(Vec3::from(g.means[i]));
+            let (backward, forward) = (turned(g.velocity_backward[i]), turned(g.velocity_forward[i]));
+            cloud.push(place, backward, forward, g.opacities[i] >= SURFACE_OPACITY);
+        }
+    }
+    cloud
+}
+
+/// What the pictures of one timestep show, for scenes whose Gaussians belong to no pixel; these stand still.
+fn drawn_cloud(clip: &Clip, step: usize, views: &[RenderedView]) -> StepCloud {
+    let mut cloud = StepCloud::default();
+    let cameras: Vec<View> = clip.views(step);
+    for (view, camera) in views.iter().zip(&cameras) {
+        for (i, (&z, &alpha)) in view.depth.iter().zip(&view.alpha).enumerate() {
+            cloud.push(unproject(camera, i, z), Vec3::ZERO, Vec3::ZERO, alpha >= SURFACE_OPACITY);
+        }
+    }
+    cloud
+}

@@ -1,0 +1,103 @@
+//! What is true of one picture, at the picture's size.
+
+use anyhow::Result;
+use storm_model::metrics::image::{Held, Image, ImageScores};
+use storm_render::world::WorldFrame;
+
+use crate::pipeline::front::TruthImage;
+use crate::source::event::Truth;
+use crate::source::topics::TruthKind;
+
+/// Ground truth of one picture, row-major at the picture's size; `None` where the recording has none.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TruthAt {
+    /// Width and height.
+    pub size: (usize, usize),
+    /// z-depth, metres, 0 for sky.
+    pub depth: Option<Vec<f32>>,
+    /// Scene flow, m/s in map axes.
+    pub flow: Option<Vec<[f32; 3]>>,
+    /// Not 0 where the surface moves.
+    pub moving: Option<Vec<u16>>,
+    /// Not 0 in the sky.
+    pub sky: Option<Vec<u16>>,
+    /// Object number, 0 for the static scene.
+    pub instance: Option<Vec<u16>>,
+}
+
+impl TruthAt {
+    /// Nothing known.
+    pub fn none(size: (usize, usize)) -> Self {
+        Self { size, depth: None, flow: None, moving: None, sky: None, instance: None }
+    }
+
+    /// Of a drawn frame, at its own size.
+    pub fn of_frame(frame: WorldFrame) -> Self {
+        let mask = |m: Vec<u8>| Some(m.into_iter().map(u16::from).collect());
+        Self {
+            size: (frame.width, frame.height),
+            depth: Some(frame.depth),
+            flow: Some(frame.flow),
+            moving: mask(frame.moving),
+            sky: mask(frame.sky),
+            instance: Some(frame.instance),
+        }
+    }
+
+    /// Takes one kind from a recorded image, sampled at pixel centres; an image whose length does not fit its size is none.
+    pub fn set(&mut self, kind: TruthKind, image: &TruthImage) {
+        let size = self.size;
+        match (&*image.data, kind) {
+            (Truth::Depth(d), _) => self.depth = sample(d, image, size),
+            (Truth::Flow(f), _) => self.flow = sample(f, image, size),
+            (Truth::Mask(m), TruthKind::Moving) => self.moving = sample(m, image, size),
+            (Truth::Mask(m), TruthKind::Sky) => self.sky = sample(m, image, size),
+            (Truth::Mask(m), _) => self.instance = sample(m, image, size),
+        }
+    }
+
+    /// Scores of a picture against what the camera saw; `depth` is the prediction, where the method has one.
+    pub fn compare(&self, pred01: &[f32], true01: &[f32], depth: Option<&[f32]>) -> Result<ImageScores> {
+        let image = |values| Image { values, width: self.size.0, height: self.size.1, channels: 3 };
+        let flags = |mask: &Option<Vec<u16>>| mask.as_ref().map(|m| m.iter().map(|&x| x != 0).collect::<Vec<bool>>());
+        let (sky, dynamic) = (flags(&self.sky), flags(&self.moving));
+        let held = Held {
+            pred: image(pred01),
+            truth: image(true01),
+            depth: depth.zip(self.depth.as_deref()),
+            sky: sky.as_deref(),
+            dynamic: dynamic.as_deref(),
+        };
+        Ok(held.scores()?)
+    }
+}
+
+/// 8-bit values as 0 to 1.
+pub fn unit(bytes: &[u8]) -> Vec<f32> {
+    bytes.iter().map(|&b| b as f32 / 255.0).collect()
+}
+
+/// `data` at the centres of a `width x height` picture's pixels; `None` when its length does not fit its size.
+fn sample<T: Copy>(data: &[T], image: &TruthImage, (width, height): (usize, usize)) -> Option<Vec<T>> {
+    if data.len() != image.width * image.height || data.is_empty() {
+        return None;
+    }
+    let at = |i: usize, from: usize, to: usize| ((2 * i + 1) * from / (2 * to)).min(from - 1);
+    let pixel = |k: usize| data[at(k / width, image.height, height) * image.width + at(k % width, image.width, width)];
+    Some((0..width * height).map(pixel).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    #[test]
+    fn truth_is_sampled_at_pixel_centres() {
+        let image = TruthImage { width: 4, height: 2, data: Arc::new(Truth::Mask(Vec::new())) };
+        assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (2, 1)), Some(vec![5, 7]));
+        assert_eq!(sample(&[0, 1, 2, 3, 4, 5, 6, 7], &image, (4, 2)), Some(vec![0, 1, 2, 3, 4, 5, 6, 7]));
+        assert_eq!(sample(&[0, 1], &image, (4, 2)), None);
+    }
+}
