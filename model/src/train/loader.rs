@@ -8,6 +8,7 @@ use std::sync::mpsc::{Receiver, sync_channel};
 
 use super::clips::{ClipOptions, ClipPlan, TrainClip};
 use super::error::TrainError;
+use super::source::Batches;
 use crate::config::ModelConfig;
 
 /// Which samples.
@@ -47,7 +48,7 @@ pub struct Loader {
 impl Loader {
     /// Starts at batch `first` with `threads` threads (0: as many as there are cores, at most 4). They end when the
     /// loader is dropped.
-    pub fn new(options: DataOptions, config: Arc<ModelConfig>, first: u64, threads: usize) -> Self {
+    pub fn new(options: impl Batches + Clone + 'static, config: Arc<ModelConfig>, first: u64, threads: usize) -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from).min(4);
         let threads = if threads == 0 { cores } else { threads };
         let lane = |k: usize| {
