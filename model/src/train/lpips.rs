@@ -104,7 +104,11 @@ impl FeatureNetwork {
             } else {
                 None
             };
-            let bias = get(format!("features.{place}.bias"))?.reshape(out)?;
+            let name = format!("features.{place}.bias");
+            let bias = get(name.clone())?;
+            if bias.dims() != [out] {
+                candle_core::bail!("{name} has shape {:?} for {out} channels", bias.dims());
+            }
             let rows = weight.permute((0, 2, 3, 1))?.contiguous()?.reshape((out, kernel * kernel * into))?;
             let first = kernel == ALEX_KERNEL;
             convs.push(Conv {
@@ -309,7 +313,7 @@ mod tests {
                 let x = t["features.5.weight"].clone();
                 t.insert("features.2.weight".into(), x);
             },
-            "features.2.weight",
+            "features.2.bias has shape",
         );
         refuse(
             &|t| {

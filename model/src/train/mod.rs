@@ -6,6 +6,7 @@ mod checkpoint;
 mod clip_tests;
 mod clips;
 mod error;
+mod guard;
 mod held_pictures;
 mod loader;
 pub mod losses;

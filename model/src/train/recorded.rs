@@ -124,3 +124,114 @@ pub fn recorded_clip(
     let target = if target.is_empty() { None } else { Some(batch(target, &shots(target))?) };
     Ok(TrainClip { context: clip, context_truth, sky: SkySamples::of(&made, config)?, target })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Arc, Mutex};
+
+    use storm_render::raster::CpuRasterizer;
+
+    use super::*;
+    use crate::network::Storm;
+    use crate::train::losses::RenderLossOptions;
+    use crate::train::{PixelLossOptions, SharedRenderer, pixel_losses, render_stage_losses};
+
+    const SIZE: (usize, usize) = (24, 16);
+
+    fn config() -> ModelConfig {
+        ModelConfig {
+            embed_dim: 32,
+            depth: 1,
+            num_heads: 2,
+            image_height: SIZE.1,
+            image_width: SIZE.0,
+            upsampler_widths: vec![16, 16, 8],
+            ..ModelConfig::preset("tiny").unwrap()
+        }
+    }
+
+    /// Two timesteps of one camera, a target between them, with the labels given.
+    fn clip(depth: Option<&[f32]>, sky: Option<&[SkyLabel]>) -> TrainClip {
+        let rgb: Vec<u8> = (0..3 * SIZE.0 * SIZE.1).map(|i| (i * 37 % 251) as u8).collect();
+        let intrinsics = Intrinsics { fx: 12.0, fy: 12.0, cx: 12.0, cy: 8.0, width: SIZE.0, height: SIZE.1 };
+        // Optical axes in a frame of x forward, y left, z up.
+        let axes = glam::Mat3::from_cols(glam::Vec3::NEG_Y, glam::Vec3::NEG_Z, glam::Vec3::X);
+        let picture = |time_sec: f32| RecordedPicture {
+            rgb: &rgb,
+            intrinsics,
+            anchor_from_camera: Affine3A::from_mat3_translation(axes, glam::Vec3::X * 5.0 * time_sec),
+            time_sec,
+            depth,
+            sky,
+        };
+        let rows = |times: &[f32]| times.iter().map(|&t| vec![picture(t)]).collect::<Vec<_>>();
+        recorded_clip(&rows(&[0.0, 0.5]), &rows(&[0.2]), 2.0, &config()).unwrap()
+    }
+
+    /// Names of the terms of both stages, everything finite, gradients too.
+    fn terms(clip: &TrainClip) -> [Vec<&'static str>; 2] {
+        let config = config();
+        let storm = Storm::untrained(&config, 2, &Device::Cpu).unwrap();
+        let output = storm.forward(&clip.context).unwrap();
+        let renderer: SharedRenderer = Arc::new(Mutex::new(CpuRasterizer::new(config.raster_settings()).unwrap()));
+        let options = RenderLossOptions { structure_from_step: 0, ..RenderLossOptions::default() };
+        let render = render_stage_losses(&output, clip, &renderer, &options, None, 0).unwrap();
+        let pixel = pixel_losses(&output, clip, &PixelLossOptions::default()).unwrap();
+        [pixel, render].map(|terms| {
+            let values = terms.values().unwrap();
+            assert!(values.iter().all(|(_, x)| x.is_finite()), "{values:?}");
+            values.iter().map(|(name, _)| *name).collect()
+        })
+    }
+
+    #[test]
+    fn what_nobody_labelled_teaches_nothing() {
+        let [pixel, render] = terms(&clip(None, None));
+        assert_eq!(pixel, ["color", "velocity"]);
+        assert_eq!(render, ["rgb", "structure", "velocity"]);
+
+        let pixels = SIZE.0 * SIZE.1;
+        let ground: Vec<SkyLabel> =
+            (0..pixels).map(|i| if i < pixels / 2 { SkyLabel::Unknown } else { SkyLabel::Surface }).collect();
+        let [pixel, render] = terms(&clip(None, Some(&ground)));
+        assert_eq!(pixel, ["color", "opacity", "velocity"]);
+        assert_eq!(render, ["rgb", "structure", "velocity", "sky_opacity"]);
+
+        let mut depth = vec![0.0; pixels];
+        (depth[pixels - 1], depth[0], depth[1], depth[2]) = (7.5, f32::NAN, -3.0, f32::INFINITY);
+        let sparse = clip(Some(&depth), Some(&ground));
+        assert_eq!(sparse.context_truth.measured().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap(), 2.0);
+        let [pixel, render] = terms(&sparse);
+        assert_eq!(pixel, ["log_depth", "pixel_depth", "color", "opacity", "scale", "velocity"]);
+        assert_eq!(render, ["rgb", "depth", "structure", "velocity", "sky_opacity"]);
+
+        let sky: Vec<SkyLabel> =
+            (0..pixels).map(|i| if i < pixels / 2 { SkyLabel::Sky } else { SkyLabel::Surface }).collect();
+        let [pixel, _] = terms(&clip(None, Some(&sky)));
+        assert_eq!(pixel, ["color", "opacity", "sky_color", "velocity"]);
+    }
+
+    #[test]
+    fn pictures_that_do_not_fit_their_size_are_refused() {
+        let rgb = vec![0; 3 * SIZE.0 * SIZE.1];
+        let intrinsics = Intrinsics { fx: 12.0, fy: 12.0, cx: 12.0, cy: 8.0, width: SIZE.0, height: SIZE.1 };
+        let good = RecordedPicture {
+            rgb: &rgb,
+            intrinsics,
+            anchor_from_camera: Affine3A::IDENTITY,
+            time_sec: 0.0,
+            depth: None,
+            sky: None,
+        };
+        let make = |picture: RecordedPicture<'_>| recorded_clip(&[vec![picture]], &[], 2.0, &config());
+        make(good).unwrap();
+        assert!(make(RecordedPicture { rgb: &rgb[1..], ..good }).is_err());
+        assert!(make(RecordedPicture { depth: Some(&[1.0]), ..good }).is_err());
+        assert!(make(RecordedPicture { sky: Some(&[SkyLabel::Sky]), ..good }).is_err());
+        let huge = Intrinsics { width: usize::MAX, height: 2, ..intrinsics };
+        assert!(make(RecordedPicture { intrinsics: huge, ..good }).is_err());
+        let lost = Affine3A::from_translation(glam::Vec3::NAN);
+        assert!(make(RecordedPicture { anchor_from_camera: lost, ..good }).is_err());
+        assert!(recorded_clip(&[], &[], 2.0, &config()).is_err());
+    }
+}

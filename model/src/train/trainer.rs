@@ -154,8 +154,7 @@ impl Trainer {
     /// Trains on one batch.
     ///
     /// # Errors
-    /// [`TrainError::NonFinite`] names the step and the tensor; the weights are then still those before the step (except
-    /// where it is a weight).
+    /// [`TrainError::NonFinite`] names the step and the tensor; the weights are then still those before the step.
     pub fn step(&mut self, clip: &TrainClip) -> Result<StepReport, TrainError> {
         let start = Instant::now();
         let moved;
@@ -193,11 +192,11 @@ impl Trainer {
         let learning_rate = self.options.schedule.at(self.step);
         let (decay, adam) = (self.options.average_decay, self.options.adam);
         let gradient_norm = adamw::step(&mut self.slots, &gradients, self.step, learning_rate, decay, &adam);
+        if let Some((name, bad)) = self.slots.iter().find_map(Slot::spoiled) {
+            self.undo()?;
+            return Err(self.non_finite(format!("weight {name}"), bad));
+        }
         for (var, slot) in self.vars.iter().zip(&self.slots) {
-            let bad = slot.weight.iter().filter(|x| !x.is_finite()).count();
-            if bad > 0 {
-                return Err(self.non_finite(format!("weight {}", slot.name), bad));
-            }
             var.set(&Tensor::from_slice(&slot.weight, &slot.shape[..], &self.device)?)?;
         }
         let step = self.step;
@@ -231,6 +230,14 @@ impl Trainer {
                 Ok(terms)
             }
         }
+    }
+
+    /// The weights before an update that spoiled some. Moments and averages that were spoiled start anew.
+    fn undo(&mut self) -> Result<(), TrainError> {
+        for (var, slot) in self.vars.iter().zip(&mut self.slots) {
+            slot.restore(var.flatten_all()?.to_vec1()?);
+        }
+        Ok(())
     }
 
     fn non_finite(&self, tensor: String, count: usize) -> TrainError {

@@ -62,9 +62,7 @@ fn context(sets: &[(i64, u32)], start: usize, options: &ClipOptions) -> Option<V
     for step in 0..options.timesteps {
         let place_sec = step as f64 * options.stride_sec;
         let near = (from..sets.len())
-            .take_while(|&k| {
-                sets[k].1 == epoch && seconds_between(start_ns, sets[k].0) <= place_sec + tolerance_sec
-            })
+            .take_while(|&k| sets[k].1 == epoch && seconds_between(start_ns, sets[k].0) <= place_sec + tolerance_sec)
             .min_by(|&a, &b| off(a, place_sec).total_cmp(&off(b, place_sec)))?;
         if off(near, place_sec) > tolerance_sec {
             return None;
