@@ -137,6 +137,9 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     );
     let mut curves = Curves::open(&args.out, trainer.steps_done())?;
     let mut recordings = Recordings::open(&mut trainer, &args.out, &device)?;
+    if trainer.steps_done() == 0 {
+        recordings.score(&Storm::new(trainer.config(), &trainer.weights(true)?)?, 0, &device)?;
+    }
     let data = recordings.data(&trainer);
     let mut loader = Loader::new(data, trainer.config().clone(), trainer.steps_done(), args.loader_threads);
     let stop = interrupt::stop_flag();

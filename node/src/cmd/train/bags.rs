@@ -26,11 +26,14 @@ use crate::window::{PosedSet, camera_from_flu, relative};
 
 use super::cuts::{Cut, cuts};
 
-/// Pictures kept in memory at most, bytes, over all bags' sets of one bag.
+/// Pictures of one bag kept in memory at most, bytes.
 const MEMORY_LIMIT: usize = 4 << 30;
 
 /// Pictures whose darkest and brightest value are no further apart show nothing: a covered lens, a decoder's grey.
 const FLAT: u8 = 2;
+
+/// Target moments of a clip that is scored.
+const SCORED: usize = 8;
 
 /// Rays this far below the vehicle's horizontal meet the ground (slopes of 10 degrees and more are no roads).
 const GROUND_BELOW_DEG: f64 = 10.0;
@@ -166,12 +169,14 @@ impl BagClips {
         self.depth_labels
     }
 
-    /// Clips that lie outside the range to learn from, with all their moments but the context's as targets.
+    /// Clips that lie outside the range to learn from, their targets spread over the moments that are not context.
     pub fn outside(&self, config: &ModelConfig) -> Vec<Result<TrainClip, TrainError>> {
         self.outside
             .iter()
             .map(|cut| {
-                let targets: Vec<usize> = cut.moments.clone().filter(|k| !cut.context.contains(k)).collect();
+                let held: Vec<usize> = cut.moments.clone().filter(|k| !cut.context.contains(k)).collect();
+                let want = SCORED.min(held.len());
+                let targets: Vec<usize> = (0..want).map(|i| held[i * held.len() / want]).collect();
                 self.cut(cut, &targets, false, config)
             })
             .collect()
