@@ -31,7 +31,7 @@ fn a_drive_becomes_a_results_folder_and_twice_the_same_one() {
         assert!(!bytes(&a, name).is_empty(), "{name} is empty");
     }
     let m = metrics(&a);
-    assert_eq!(m["weights"], "untrained");
+    assert_eq!(m["weights"], "tiny (shipped)");
     assert_eq!(m["nonfinite"], 0);
     assert_eq!(m["frames_in"], 26);
     // 26 frames at 10 Hz; the first window is full at frame 15.

@@ -22,6 +22,36 @@ choice!(
 );
 
 choice!(
+    /// Where the velocity bases of the motion tokens start from.
+    VelocityBases {
+        /// The decoder's output is the velocity (paper and authors).
+        Learned,
+        /// The decoder's output is added to a fixed fan of velocities, see [`spread_bases`]: an untrained network can then
+        /// already learn which pixel moves how, instead of waiting for bases that differ. For small training budgets.
+        Spread,
+    }
+);
+
+/// The fan that [`VelocityBases::Spread`] starts from, m/s in the anchor's axes (x forward, y left, z up): along
+/// and across the road, in pairs that cancel, so that equal weights mean standing still. The first is zero.
+pub fn spread_bases(count: usize) -> Vec<[f32; 3]> {
+    let pair = |k: usize| {
+        let ring = (k / 3) as f32;
+        match k % 3 {
+            0 => [3.0 + 6.0 * ring, 0.0, 0.0],
+            1 => [6.0 + 6.0 * ring, 0.0, 0.0],
+            _ => [0.0, 4.0 + 4.0 * ring, 0.0],
+        }
+    };
+    let mut bases = vec![[0.0; 3]; count];
+    for (k, two) in bases.get_mut(1..).unwrap_or_default().chunks_exact_mut(2).enumerate() {
+        two[0] = pair(k);
+        two[1] = pair(k).map(|x| -x);
+    }
+    bases
+}
+
+choice!(
     /// What the depth channel measures.
     DepthMeaning {
         /// Depth along the optical axis: the ray has z = 1 (authors).

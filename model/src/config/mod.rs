@@ -6,7 +6,7 @@ mod validate;
 
 pub use choices::{
     AffineKind, ColorActivation, ColorBase, DepthActivation, DepthMeaning, GsplatConvention, MaskDecoder,
-    RayPixelOffset, SkyKind, VelocityKind,
+    RayPixelOffset, SkyKind, VelocityBases, VelocityKind, spread_bases,
 };
 use serde::{Deserialize, Serialize};
 pub use validate::{MAX_CAMERAS, MAX_TIMESTEPS};
@@ -51,6 +51,8 @@ pub struct ModelConfig {
     pub velocity: VelocityKind,
     /// Velocities are the decoder's output times this, m/s.
     pub velocity_scale: f64,
+    /// What that output is added to.
+    pub velocity_bases: VelocityBases,
     /// Which mask decoder.
     pub mask_decoder: MaskDecoder,
     /// Channels after each doubling of the upsampler; one entry per factor of two in `patch_size`.

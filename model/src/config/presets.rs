@@ -22,6 +22,7 @@ impl Default for ModelConfig {
             tau: 0.5,
             velocity: VelocityKind::One,
             velocity_scale: 1.0,
+            velocity_bases: VelocityBases::Learned,
             mask_decoder: MaskDecoder::Authors,
             upsampler_widths: vec![512, 256, 128],
             key_hidden: 256,
@@ -117,6 +118,7 @@ impl ModelConfig {
             affine: AffineKind::MatrixBias,
             flow_gate_mps: 0.0,
             velocity_scale: 10.0,
+            velocity_bases: VelocityBases::Spread,
             ..Self::default()
         }
     }
@@ -127,6 +129,7 @@ impl ModelConfig {
             near: 0.1,
             far: 400.0,
             velocity: VelocityKind::ForwardBackward,
+            velocity_bases: VelocityBases::Learned,
             mask_decoder: MaskDecoder::Paper,
             depth_meaning: DepthMeaning::RayDistance,
             depth_activation: DepthActivation::Sigmoid,

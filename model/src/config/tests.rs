@@ -57,3 +57,19 @@ fn every_bad_value_is_named() {
         assert!(error.contains(field), "{field}: {error}");
     }
 }
+
+#[test]
+fn spread_bases_cancel_and_differ() {
+    for count in [0, 1, 2, 4, 8, 16, 31, 32] {
+        let bases = spread_bases(count);
+        assert_eq!(bases.len(), count);
+        for axis in 0..3 {
+            assert_eq!(bases.iter().map(|b| b[axis]).sum::<f32>(), 0.0, "{count} bases");
+        }
+        let zeros = bases.iter().filter(|b| **b == [0.0; 3]).count();
+        assert_eq!(zeros, if count == 0 { 0 } else { 1 + (count + 1) % 2 });
+        for (i, a) in bases.iter().enumerate() {
+            assert!(*a == [0.0; 3] || bases[..i].iter().all(|b| a != b), "{count} bases: {a:?} stands twice");
+        }
+    }
+}

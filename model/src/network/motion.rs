@@ -1,11 +1,11 @@
 //! Motion tokens and mask decoder: velocities as a soft mixture of a few bases (paper section 3.1).
 
-use candle_core::{D, Tensor};
+use candle_core::{D, Device, Tensor};
 
 use super::params::{Mlp, Params};
 use super::stages::Stages;
 use super::upsample::{Upsampler, unnest};
-use crate::config::{MaskDecoder, ModelConfig, VelocityKind};
+use crate::config::{MaskDecoder, ModelConfig, VelocityBases, VelocityKind, spread_bases};
 use crate::error::ModelError;
 use crate::ops::{Activation, Linear, linear, softmax};
 
@@ -37,6 +37,17 @@ const PROBED_PICTURE: usize = 1;
 /// Dot products of every row of `x` with every row of `rows`.
 fn product(x: &Tensor, rows: Tensor) -> candle_core::Result<Tensor> {
     linear(x, &Linear::new(rows, None), Activation::None, None)
+}
+
+/// The velocities that spread bases start from, `(M, 3 | 6)`.
+fn fan(config: &ModelConfig, device: &Device) -> candle_core::Result<Tensor> {
+    let row = |v: [f32; 3]| match config.velocity {
+        VelocityKind::One => v.to_vec(),
+        // `v-` is the velocity for earlier times with its sign turned (paper eq. 1).
+        VelocityKind::ForwardBackward => [v.map(|x| -x), v].concat(),
+    };
+    let bases = spread_bases(config.num_motion_tokens).into_iter().flat_map(row).collect::<Vec<f32>>();
+    Tensor::from_vec(bases, (config.num_motion_tokens, config.velocity_channels()), device)
 }
 
 impl MotionHead {
@@ -127,6 +138,10 @@ impl MotionHead {
             own => each(own)?,
         };
         let bases = if config.velocity_scale == 1.0 { bases } else { (bases * config.velocity_scale)? };
+        let bases = match config.velocity_bases {
+            VelocityBases::Learned => bases,
+            VelocityBases::Spread => bases.broadcast_add(&fan(config, bases.device())?)?,
+        };
         Ok((queries, bases))
     }
 }

@@ -1,10 +1,12 @@
-//! AdamW with decoupled weight decay, and clipping by the global gradient norm.
+//! AdamW with decoupled weight decay (and, where chosen, Muon), and clipping by the global gradient norm.
 //!
 //! Plain loops over plain numbers, tensors in parallel: each tensor is walked by one thread in order and norms are summed
 //! in the tensors' order, so the result does not depend on the number of threads.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+
+use super::muon::{self, Optimizer};
 
 /// AdamW's constants.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -75,7 +77,7 @@ pub fn global_norm(gradients: &[Option<Vec<f32>>]) -> f64 {
     squares.iter().sum::<f64>().sqrt()
 }
 
-/// One step of all tensors: clip, AdamW, moving average. `step` counts from 0; `gradients` in the slots' order.
+/// One step of all tensors: clip, AdamW or Muon, moving average. `step` counts from 0; `gradients` in the slots' order.
 ///
 /// Returns the gradients' norm before clipping.
 pub fn step(
@@ -84,8 +86,9 @@ pub fn step(
     step: u64,
     learning_rate: f64,
     average_decay: f64,
+    optimizer: Optimizer,
     options: &AdamOptions,
-) -> f64 {
+) -> candle_core::Result<f64> {
     let norm = global_norm(gradients);
     let clip = if options.clip_norm > 0.0 && norm > options.clip_norm { options.clip_norm / norm } else { 1.0 };
     let power = i32::try_from(step + 1).unwrap_or(i32::MAX);
@@ -95,18 +98,30 @@ pub fn step(
     // An average over the first steps would mostly remember the untrained network.
     let keep = average_decay.min((1.0 + step as f64) / (10.0 + step as f64)) as f32;
     let clip = clip as f32;
-    slots.par_iter_mut().zip(gradients).for_each(|(slot, gradient)| {
+    slots.par_iter_mut().zip(gradients).try_for_each(|(slot, gradient)| {
         let shrink = if slot.decays { (1.0 - learning_rate * options.weight_decay) as f32 } else { 1.0 };
-        let Slot { weight, first, second, average, .. } = slot;
-        for i in 0..weight.len() {
-            let g = gradient.as_ref().map_or(0.0, |g| g[i] * clip);
-            first[i] = b1 * first[i] + (1.0 - b1) * g;
-            second[i] = b2 * second[i] + (1.0 - b2) * g * g;
-            weight[i] = shrink * weight[i] - rate * first[i] / (root * second[i].sqrt() + eps);
-            average[i] = keep * average[i] + (1.0 - keep) * weight[i];
+        let Slot { name, shape, weight, first, second, average, .. } = slot;
+        let clipped = |i: usize| gradient.as_ref().map_or(0.0, |g| g[i] * clip);
+        if optimizer == Optimizer::Muon && muon::takes(name, shape) {
+            let gradient: Vec<f32> = (0..weight.len()).map(clipped).collect();
+            let update = muon::update(name, shape, &gradient, first)?;
+            for (w, u) in weight.iter_mut().zip(update) {
+                *w = shrink * *w - learning_rate as f32 * u;
+            }
+        } else {
+            for i in 0..weight.len() {
+                let g = clipped(i);
+                first[i] = b1 * first[i] + (1.0 - b1) * g;
+                second[i] = b2 * second[i] + (1.0 - b2) * g * g;
+                weight[i] = shrink * weight[i] - rate * first[i] / (root * second[i].sqrt() + eps);
+            }
         }
-    });
-    norm
+        for (a, w) in average.iter_mut().zip(weight) {
+            *a = keep * *a + (1.0 - keep) * *w;
+        }
+        candle_core::Result::Ok(())
+    })?;
+    Ok(norm)
 }
 
 #[cfg(test)]
@@ -131,7 +146,7 @@ mod tests {
             let loss = (var.as_tensor() - f64::from(k % 3)).unwrap().sqr().unwrap().sum_all().unwrap();
             let grads = loss.backward().unwrap();
             let g = grads.get(&var).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
-            step(&mut slots, &[Some(g)], k as u64, 0.01, 0.999, &options);
+            step(&mut slots, &[Some(g)], k as u64, 0.01, 0.999, muon::Optimizer::AdamW, &options).unwrap();
             theirs.step(&grads).unwrap();
         }
         let want = var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
@@ -146,7 +161,8 @@ mod tests {
         let mut slots = [Slot::new("norm.weight", &[2], vec![1.0; 2]), Slot::new("x.weight", &[1, 2], vec![1.0; 2])];
         assert!(!slots[0].decays && slots[1].decays);
         assert!(!Slot::new("motion_tokens", &[1, 2, 3], vec![0.0; 6]).decays);
-        let norm = step(&mut slots, &[Some(vec![3.0, 0.0]), Some(vec![0.0, 4.0])], 0, 0.1, 0.9, &options);
+        let gradients = [Some(vec![3.0, 0.0]), Some(vec![0.0, 4.0])];
+        let norm = step(&mut slots, &gradients, 0, 0.1, 0.9, muon::Optimizer::AdamW, &options).unwrap();
         assert_eq!(norm, 5.0);
         // First moments hold a tenth of the clipped gradient.
         assert!((slots[0].first[0] - 0.06).abs() < 1e-7 && (slots[1].first[1] - 0.08).abs() < 1e-7);

@@ -81,7 +81,7 @@ fn the_anchor_is_the_front_camera_and_static_points_agree_between_pictures() {
 #[test]
 fn any_number_of_threads_gives_the_same_batches() {
     let config = Arc::new(ModelConfig::preset("tiny").unwrap());
-    let options = DataOptions { seed: 9, batch: 2, clips: small(), one_camera_batches: 1 };
+    let options = DataOptions { seed: 9, batch: 2, clips: small(), one_camera_batches: 1, reuse: 1 };
     let run = |threads: usize, first: u64| {
         let mut loader = Loader::new(options.clone(), Arc::clone(&config), first, threads);
         (0..3).map(|_| loader.next_batch().unwrap()).collect::<Vec<_>>()
@@ -95,4 +95,28 @@ fn any_number_of_threads_gives_the_same_batches() {
         assert_eq!(values(&a.sky.directions), values(&b.sky.directions));
     }
     assert_ne!(values(&one[1].context.image), values(&one[2].context.image));
+}
+
+#[test]
+fn variety_changes_lenses_and_cameras_and_nothing_else() {
+    let usual = ClipOptions::default();
+    let varied = ClipOptions { variety: true, ..usual };
+    let mut zoomed = 0;
+    for k in 0..200 {
+        let (a, b) = (ClipPlan::training(1, k, &usual), ClipPlan::training(1, k, &varied));
+        assert_eq!(a, ClipPlan { zoom: [1.0; 2], ..b.clone() });
+        zoomed += usize::from(b.zoom != [1.0; 2]);
+    }
+    assert!((60..140).contains(&zoomed), "{zoomed} of 200");
+    let data = DataOptions {
+        seed: 2,
+        batch: 1,
+        clips: ClipOptions { variety: true, ..small() },
+        one_camera_batches: 0,
+        reuse: 1,
+    };
+    let config = ModelConfig::preset("tiny").unwrap();
+    let cameras = |n: u64| data.batch(32 * n, &config).unwrap().context.dims().unwrap()[2];
+    let seen: std::collections::BTreeSet<usize> = (0..12).map(cameras).collect();
+    assert!(seen.contains(&3) && seen.len() >= 2, "{seen:?}");
 }

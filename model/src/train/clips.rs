@@ -1,5 +1,7 @@
 //! Training clips from procedural drives: pictures, poses and ground truth in the window's anchor frame.
 
+use std::borrow::Borrow;
+
 use candle_core::{Device, Tensor};
 use glam::{Affine3A, DAffine3, DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -42,7 +44,15 @@ pub struct ClipOptions {
     pub drive_sec: f64,
     /// Least and most traffic (1 is the usual).
     pub traffic: [f64; 2],
+    /// Whether lenses vary from clip to clip, and the number of cameras (up to `cameras`) from block to block of batches.
+    pub variety: bool,
 }
+
+/// Share of the clips that keep the drive's own lenses where lenses vary.
+const OWN_LENS_SHARE: f64 = 0.5;
+
+/// Least and most focal length over the drive's own, across and down: 50 degrees become 32 to 92.
+const ZOOM: [[f64; 2]; 2] = [[0.45, 1.6], [0.6, 1.6]];
 
 impl Default for ClipOptions {
     fn default() -> Self {
@@ -56,6 +66,7 @@ impl Default for ClipOptions {
             targets: 4,
             drive_sec: 12.0,
             traffic: [0.75, 2.5],
+            variety: false,
         }
     }
 }
@@ -109,6 +120,8 @@ pub struct ClipPlan {
     pub target_sec: Vec<f64>,
     /// Density of traffic.
     pub traffic: f64,
+    /// Factors on the focal lengths.
+    pub zoom: [f32; 2],
 }
 
 impl ClipPlan {
@@ -119,7 +132,12 @@ impl ClipPlan {
         let drive_seed = rng.random_range(HELD_OUT_SEEDS.end..u64::MAX);
         let [low, high] = options.traffic;
         let traffic = low + (high - low) * rng.random::<f64>();
-        Self::draw(drive_seed, traffic, &mut rng, options)
+        let plan = Self::draw(drive_seed, traffic, &mut rng, options);
+        if !options.variety || rng.random::<f64>() < OWN_LENS_SHARE {
+            return plan;
+        }
+        let zoom = ZOOM.map(|[low, high]| (low * (high / low).powf(rng.random::<f64>())) as f32);
+        Self { zoom, ..plan }
     }
 
     /// A clip of a given drive, for validation: usual traffic, moments drawn from the drive's seed.
@@ -134,7 +152,7 @@ impl ClipPlan {
         let mut target_sec: Vec<f64> =
             (0..options.targets).map(|_| rng.random_range(0..frames) as f64 / RATE_HZ).collect();
         target_sec.sort_by(f64::total_cmp);
-        Self { drive_seed, start_sec, target_sec, traffic }
+        Self { drive_seed, start_sec, target_sec, traffic, zoom: [1.0; 2] }
     }
 
     /// Drives it. `config` says what the network's depth measures and where its rays pass.
@@ -148,6 +166,7 @@ impl ClipPlan {
             height: options.height,
             rate_hz: RATE_HZ,
             traffic: self.traffic,
+            zoom: self.zoom,
             ..DriveOptions::default()
         })?;
         let anchor_from_map =
@@ -221,8 +240,9 @@ impl Shot {
 
 impl TrainClip {
     /// Several clips of the same sizes as one batch.
-    pub fn stack(clips: &[Self]) -> Result<Self, TrainError> {
-        let all = |pick: fn(&Self) -> ClipBatch| ClipBatch::stack(&clips.iter().map(pick).collect::<Vec<_>>());
+    pub fn stack<C: Borrow<Self>>(clips: &[C]) -> Result<Self, TrainError> {
+        let clips: Vec<&Self> = clips.iter().map(Borrow::borrow).collect();
+        let all = |pick: fn(&Self) -> ClipBatch| ClipBatch::stack(&clips.iter().map(|c| pick(c)).collect::<Vec<_>>());
         let targets: Vec<&(ClipBatch, Truth)> = clips.iter().filter_map(|c| c.target.as_ref()).collect();
         let target = if targets.is_empty() {
             None

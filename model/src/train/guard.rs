@@ -31,6 +31,7 @@ impl Slot {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::Optimizer;
     use crate::train::adamw::{AdamOptions, step};
 
     #[test]
@@ -38,7 +39,8 @@ mod tests {
         let options = AdamOptions { clip_norm: 0.0, ..AdamOptions::default() };
         let mut slots = [Slot::new("a.weight", &[1, 2], vec![1.0, 2.0]), Slot::new("b.weight", &[1, 1], vec![3.0])];
         // Its square is no f32.
-        step(&mut slots, &[Some(vec![1e30, 1.0]), Some(vec![1.0])], 0, 0.1, 0.9, &options);
+        let gradients = [Some(vec![1e30, 1.0]), Some(vec![1.0])];
+        step(&mut slots, &gradients, 0, 0.1, 0.9, Optimizer::AdamW, &options).unwrap();
         assert_eq!(slots[0].spoiled(), Some(("a.weight".to_string(), 1)));
         assert_eq!(slots[1].spoiled(), None);
         slots[0].restore(vec![1.0, 2.0]);

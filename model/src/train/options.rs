@@ -6,6 +6,7 @@ use super::adamw::AdamOptions;
 use super::clips::ClipOptions;
 use super::error::TrainError;
 use super::losses::RenderLossOptions;
+use super::muon::Optimizer;
 use super::pixel::PixelLossOptions;
 use super::schedule::Schedule;
 use super::source::RecordingOptions;
@@ -36,6 +37,9 @@ pub struct TrainOptions {
     pub stage: Stage,
     /// Learning rate.
     pub schedule: Schedule,
+    /// What moves the blocks' matrices.
+    #[serde(default)]
+    pub optimizer: Optimizer,
     /// AdamW and clipping.
     pub adam: AdamOptions,
     /// Moving average of the weights: how much of it stays per step.
@@ -54,6 +58,13 @@ pub struct TrainOptions {
     /// File of the feature network of the perceptual term; none: the structure term stands in for it.
     #[serde(default)]
     pub features: Option<String>,
+    /// How many times each clip is shown.
+    #[serde(default = "once")]
+    pub reuse: u64,
+}
+
+fn once() -> u64 {
+    1
 }
 
 impl TrainOptions {
@@ -66,6 +77,7 @@ impl TrainOptions {
             batch,
             stage: Stage::Pixel,
             schedule: Schedule { peak, warmup_steps, steps, end_share: 0.01 },
+            optimizer: Optimizer::AdamW,
             adam: AdamOptions::default(),
             average_decay: 0.999,
             pixel: PixelLossOptions::default(),
@@ -74,6 +86,7 @@ impl TrainOptions {
             one_camera_steps: 0,
             recordings: None,
             features: None,
+            reuse: 1,
         }
     }
 
@@ -90,6 +103,7 @@ impl TrainOptions {
         }
         let peak = self.schedule.peak;
         rule(peak > 0.0 && peak <= 1.0, "lr", peak, "more than 0, at most 1")?;
+        rule((1..=1000).contains(&self.reuse), "reuse", self.reuse as f64, "1 to 1000")?;
         rule(self.schedule.steps > 0, "steps", 0.0, "at least 1")?;
         rule(unit.contains(&self.average_decay), "average_decay", self.average_decay, "0 to below 1")?;
         let a = &self.adam;
@@ -153,7 +167,7 @@ impl TrainOptions {
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
-            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera); batch {}, peak rate {:e}, schedule of {} steps",
+            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
             self.history,
             self.seed,
             c.cameras,
@@ -161,7 +175,13 @@ impl TrainOptions {
             c.width,
             c.height,
             self.one_camera_steps,
+            self.reuse,
+            if c.variety { ", varied lenses and numbers of cameras" } else { "" },
             self.batch,
+            match self.optimizer {
+                Optimizer::AdamW => "AdamW",
+                Optimizer::Muon => "Muon and AdamW",
+            },
             self.schedule.peak,
             self.schedule.steps,
         )

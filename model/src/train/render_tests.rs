@@ -7,7 +7,7 @@ use super::clips::{ClipOptions, ClipPlan, TrainClip};
 use super::raster::SharedRenderer;
 use super::render_stage::draw_targets;
 use super::views::views;
-use crate::config::{AffineKind, ModelConfig, VelocityKind};
+use crate::config::{AffineKind, ModelConfig, VelocityBases, VelocityKind};
 use crate::network::Storm;
 use crate::scene::Want;
 use crate::weights::untrained;
@@ -33,6 +33,7 @@ fn config(velocity: VelocityKind) -> ModelConfig {
         num_motion_tokens: 4,
         affine: AffineKind::MatrixBias,
         velocity,
+        velocity_bases: VelocityBases::Learned,
         ..ModelConfig::preset("tiny").unwrap()
     }
 }

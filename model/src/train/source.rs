@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::clips::TrainClip;
 use super::error::TrainError;
-use super::loader::DataOptions;
+use super::loader::{DataOptions, KeptClips};
 use crate::config::ModelConfig;
 
 /// Keeps the choice of a batch's source apart from the choice of its clips, which have the same seed.
@@ -17,14 +17,8 @@ const CHOICE: u64 = 0x5354_4f52_4d42_4147;
 
 /// Batches by number, the same ones whenever and on whatever thread they are made.
 pub trait Batches: Send + Sync {
-    /// Batch `index` of the run.
-    fn batch(&self, index: u64, config: &ModelConfig) -> Result<TrainClip, TrainError>;
-}
-
-impl Batches for DataOptions {
-    fn batch(&self, index: u64, config: &ModelConfig) -> Result<TrainClip, TrainError> {
-        DataOptions::batch(self, index, config)
-    }
+    /// Batch `index` of the run; `kept` holds clips that will be shown again.
+    fn batch_with(&self, index: u64, config: &ModelConfig, kept: &KeptClips) -> Result<TrainClip, TrainError>;
 }
 
 /// A recording clips are cut from.
@@ -143,8 +137,10 @@ impl MixedData {
 }
 
 impl Batches for MixedData {
-    fn batch(&self, index: u64, config: &ModelConfig) -> Result<TrainClip, TrainError> {
-        let Some(picks) = self.picks(index) else { return self.drives.batch(index, config) };
+    fn batch_with(&self, index: u64, config: &ModelConfig, kept: &KeptClips) -> Result<TrainClip, TrainError> {
+        let Some(picks) = self.picks(index) else {
+            return Batches::batch_with(&self.drives, index, config, kept);
+        };
         let one_camera = index < self.drives.one_camera_batches;
         let made = picks
             .iter()
@@ -174,7 +170,7 @@ mod tests {
     }
 
     fn mixed(share: f64) -> MixedData {
-        let drives = DataOptions { seed: 4, batch: 3, clips: ClipOptions::default(), one_camera_batches: 0 };
+        let drives = DataOptions { seed: 4, batch: 3, clips: ClipOptions::default(), one_camera_batches: 0, reuse: 1 };
         MixedData { drives, recordings: vec![Arc::new(Counts(30, 20)), Arc::new(Counts(10, 5))], share }
     }
 
@@ -203,7 +199,10 @@ mod tests {
         assert!((0..200).all(|k| mixed(1.0).picks(k).is_some()));
         let none = MixedData { recordings: Vec::new(), ..mixed(1.0) };
         assert!((0..200).all(|k| none.picks(k).is_none()));
-        assert!(matches!(mixed(1.0).batch(0, &ModelConfig::default()), Err(TrainError::Source(_))));
+        assert!(matches!(
+            mixed(1.0).batch_with(0, &ModelConfig::default(), &KeptClips::default()),
+            Err(TrainError::Source(_))
+        ));
     }
 
     #[test]

@@ -129,7 +129,7 @@ impl Trainer {
             // Nothing is drawn, so target pictures would be made for nothing.
             clips.targets = 0;
         }
-        DataOptions { seed: o.seed, batch: o.batch, clips, one_camera_batches: o.one_camera_steps }
+        DataOptions { seed: o.seed, batch: o.batch, clips, one_camera_batches: o.one_camera_steps, reuse: o.reuse }
     }
 
     pub(super) fn parts(&self) -> (&[Slot], &Tensors) {
@@ -190,8 +190,9 @@ impl Trainer {
         let backward_sec = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let learning_rate = self.options.schedule.at(self.step);
-        let (decay, adam) = (self.options.average_decay, self.options.adam);
-        let gradient_norm = adamw::step(&mut self.slots, &gradients, self.step, learning_rate, decay, &adam);
+        let TrainOptions { average_decay: decay, adam, optimizer, .. } = self.options;
+        let gradient_norm =
+            adamw::step(&mut self.slots, &gradients, self.step, learning_rate, decay, optimizer, &adam)?;
         if let Some((name, bad)) = self.slots.iter().find_map(Slot::spoiled) {
             self.undo()?;
             return Err(self.non_finite(format!("weight {name}"), bad));

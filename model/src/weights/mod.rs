@@ -7,6 +7,7 @@ mod init;
 pub(crate) mod names;
 mod pickle;
 mod safetensors;
+mod shipped;
 mod torch;
 
 use std::collections::BTreeMap;
@@ -19,6 +20,7 @@ pub use infer::infer_config;
 pub use init::untrained;
 pub use names::{Init, TensorSpec, tensor_specs};
 pub use safetensors::{SavedType, save_safetensors};
+pub use shipped::{SHIPPED_NAME, shipped};
 
 use crate::config::ModelConfig;
 use crate::error::ModelError;
@@ -53,7 +55,24 @@ trait Source {
 /// The configuration is `given`, else the file's own, else inferred from the shapes. All shapes are checked against it
 /// before any tensor is read.
 pub fn load(path: &Path, given: Option<&ModelConfig>, device: &Device) -> Result<(ModelConfig, Tensors), ModelError> {
-    let mut source = open(path)?;
+    read(&mut *open(path)?, given, device)
+}
+
+/// As [`load`], from a safetensors file that was built into the program; `name` is for messages.
+pub fn load_built_in(
+    name: &str,
+    bytes: &'static [u8],
+    given: Option<&ModelConfig>,
+    device: &Device,
+) -> Result<(ModelConfig, Tensors), ModelError> {
+    read(&mut safetensors::SafetensorsFile::built_in(name, bytes)?, given, device)
+}
+
+fn read(
+    source: &mut dyn Source,
+    given: Option<&ModelConfig>,
+    device: &Device,
+) -> Result<(ModelConfig, Tensors), ModelError> {
     // The network's name -> the file's name.
     let mut names = BTreeMap::new();
     let mut shapes = BTreeMap::new();
@@ -115,6 +134,17 @@ fn open(path: &Path) -> Result<Box<dyn Source>, WeightsError> {
         let reason = "neither safetensors nor a PyTorch zip checkpoint (or cut off at the very start)";
         Err(WeightsError::format(path, reason))
     }
+}
+
+/// Affine tokens for windows of up to `cameras` cameras: further cameras begin with the exposure of the trained ones in turn.
+/// Changes nothing where there are enough, or none at all.
+pub fn for_cameras(config: &mut ModelConfig, tensors: &mut Tensors, cameras: usize) -> Result<(), ModelError> {
+    let Some(tokens) = tensors.get("affine_token").filter(|_| cameras > config.num_cams) else { return Ok(()) };
+    let rows = (0..cameras).map(|k| tokens.narrow(1, k % config.num_cams, 1)).collect::<Result<Vec<_>, _>>()?;
+    let more = Tensor::cat(&rows, 1)?;
+    tensors.insert("affine_token".into(), more);
+    config.num_cams = cameras;
+    Ok(())
 }
 
 fn unwrapped(name: &str) -> &str {

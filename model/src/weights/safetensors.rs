@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
+use std::ops::Deref;
 use std::path::Path;
 
 use candle_core::Tensor;
@@ -23,7 +24,24 @@ const PROVENANCE_KEY: &str = "provenance";
 
 pub(super) struct SafetensorsFile {
     path: std::path::PathBuf,
-    map: Mmap,
+    bytes: Bytes,
+}
+
+/// Where a file's bytes are.
+enum Bytes {
+    Mapped(Mmap),
+    Built(&'static [u8]),
+}
+
+impl Deref for Bytes {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        match self {
+            Self::Mapped(map) => map,
+            Self::Built(bytes) => bytes,
+        }
+    }
 }
 
 impl SafetensorsFile {
@@ -32,14 +50,23 @@ impl SafetensorsFile {
         // SAFETY: the map is only read, as bytes, for as long as `self` lives; like every program that maps weights we
         // rely on nobody shortening the file meanwhile (we write files by renaming, never in place).
         let map = unsafe { Mmap::map(&file) }.map_err(|e| WeightsError::io(path, e))?;
-        let this = Self { path: path.to_owned(), map };
+        Self::checked(path, Bytes::Mapped(map))
+    }
+
+    /// A file that was built into the program; `name` is for messages.
+    pub fn built_in(name: &str, bytes: &'static [u8]) -> Result<Self, WeightsError> {
+        Self::checked(Path::new(name), Bytes::Built(bytes))
+    }
+
+    fn checked(path: &Path, bytes: Bytes) -> Result<Self, WeightsError> {
+        let this = Self { path: path.to_owned(), bytes };
         this.parse()?;
         Ok(this)
     }
 
     /// The header is checked against the file's length here, so no view reaches past it.
     fn parse(&self) -> Result<SafeTensors<'_>, WeightsError> {
-        SafeTensors::deserialize(&self.map)
+        SafeTensors::deserialize(&self.bytes)
             .map_err(|e| WeightsError::format(&self.path, format!("not valid safetensors: {e}")))
     }
 }
@@ -67,7 +94,7 @@ impl Source for SafetensorsFile {
 
     fn config(&self) -> Result<Option<ModelConfig>, WeightsError> {
         let bad = |reason: String| WeightsError::format(&self.path, reason);
-        let (_, metadata) = SafeTensors::read_metadata(&self.map).map_err(|e| bad(e.to_string()))?;
+        let (_, metadata) = SafeTensors::read_metadata(&self.bytes).map_err(|e| bad(e.to_string()))?;
         let text = metadata.metadata().as_ref().and_then(|m| m.get(CONFIG_KEY));
         let parse = |text: &String| {
             serde_json::from_str(text).map_err(|e| bad(format!("metadata '{CONFIG_KEY}' is not a configuration: {e}")))

@@ -80,7 +80,7 @@ section! {
 section! {
     /// The network.
     pub struct ModelConfigSection {
-        /// Weights file (.safetensors, .pth, .pt); empty: the weights that ship, or seeded random ones until there are any.
+        /// Weights file (.safetensors, .pth, .pt); empty: the weights that ship (preset `tiny`), seeded random ones for other presets; `untrained`: seeded random ones.
         weights: String = String::new(),
         /// Architecture when there is no weights file: tiny, small, b8, l8, xl8, h8, b16, l16, h16.
         preset: String = "tiny".into(),

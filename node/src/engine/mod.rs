@@ -10,6 +10,7 @@ use anyhow::{Context, Result};
 use candle_core::Device;
 use storm_model::config::ModelConfig;
 use storm_model::scene::{RenderedView, Scene, Want};
+use storm_model::weights::{self, Tensors};
 use storm_model::{ClipBatch, PixelLayout, Storm, ViewInput};
 use storm_render::raster::{CpuRasterizer, RasterSettings};
 use storm_render::{Intrinsics, View};
@@ -22,13 +23,18 @@ use crate::window::{PosedSet, Window, relative};
 /// How the weights a run used are called in metrics.json and the report when there are none.
 pub const UNTRAINED: &str = "untrained";
 
-/// The architecture and, if there is a weights file, the weights: known before the cameras are.
+/// The preset whose weights ship.
+pub const SHIPPED_PRESET: &str = "tiny";
+
+/// The architecture and, if there are any, the weights: known before the cameras are.
 pub enum ModelSource {
-    /// Read from a file.
+    /// Read from a file, or shipped.
     Loaded {
-        /// The network.
-        model: Box<Storm>,
-        /// The file.
+        /// The architecture.
+        config: Box<ModelConfig>,
+        /// The weights.
+        tensors: Tensors,
+        /// The file, or what the shipped weights are called.
         name: String,
     },
     /// Seeded random weights, made once the number of cameras is known.
@@ -41,24 +47,30 @@ pub enum ModelSource {
 }
 
 impl ModelSource {
-    /// Reads the weights file of the configuration, or settles on the preset with random weights.
+    /// Reads the weights file of the configuration; without one takes the weights that ship, where the preset has any, else
+    /// settles on the preset with random weights.
     pub fn open(section: &ModelConfigSection) -> Result<Self> {
-        if section.weights.is_empty() {
+        let device = device(&section.device)?;
+        let named = !section.weights.is_empty() && section.weights != UNTRAINED;
+        let ((config, tensors), name) = if named {
+            let path = Path::new(&section.weights);
+            let loaded =
+                weights::load(path, None, &device).with_context(|| format!("cannot use weights {}", path.display()))?;
+            let name = path.file_name().map_or_else(|| section.weights.clone(), |n| n.to_string_lossy().into_owned());
+            (loaded, name)
+        } else if section.weights.is_empty() && section.preset == SHIPPED_PRESET {
+            (weights::shipped(&device)?, weights::SHIPPED_NAME.to_string())
+        } else {
             let config = ModelConfig::preset(&section.preset).map_err(|e| crate::cmd::UsageError(e.to_string()))?;
             return Ok(Self::Untrained { config: Box::new(config), seed: section.untrained_seed });
-        }
-        let path = Path::new(&section.weights);
-        let model = Storm::load(path, &device(&section.device)?)
-            .with_context(|| format!("cannot use weights {}", path.display()))?;
-        let name = path.file_name().map_or_else(|| section.weights.clone(), |n| n.to_string_lossy().into_owned());
-        Ok(Self::Loaded { model: Box::new(model), name })
+        };
+        Ok(Self::Loaded { config: Box::new(config), tensors, name })
     }
 
     /// The architecture.
     pub fn config(&self) -> &ModelConfig {
         match self {
-            Self::Loaded { model, .. } => model.config(),
-            Self::Untrained { config, .. } => config,
+            Self::Loaded { config, .. } | Self::Untrained { config, .. } => config,
         }
     }
 
@@ -102,7 +114,10 @@ impl Engine {
     pub fn new(source: ModelSource, section: &ModelConfigSection, cameras: usize, timespan_sec: f64) -> Result<Self> {
         let device = device(&section.device)?;
         let (model, weights) = match source {
-            ModelSource::Loaded { model, name } => (*model, name),
+            ModelSource::Loaded { mut config, mut tensors, name } => {
+                weights::for_cameras(&mut config, &mut tensors, cameras)?;
+                (Storm::new(&config, &tensors)?, name)
+            }
             ModelSource::Untrained { mut config, seed } => {
                 config.num_cams = config.num_cams.max(cameras);
                 (Storm::untrained(&config, seed, &device)?, UNTRAINED.to_string())
@@ -122,7 +137,7 @@ impl Engine {
         *self.raster.settings()
     }
 
-    /// Name of the weights file, or [`UNTRAINED`].
+    /// Name of the weights file, what the shipped ones are called, or [`UNTRAINED`].
     pub fn weights(&self) -> &str {
         &self.weights
     }

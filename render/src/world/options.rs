@@ -34,6 +34,8 @@ pub struct DriveOptions {
     pub origin: [f64; 3],
     /// Density of vehicles, cyclists and pedestrians relative to the usual, 0 (nobody) to 3.
     pub traffic: f64,
+    /// Factors on the focal lengths across and down: other lenses, and pictures squeezed along one side.
+    pub zoom: [f32; 2],
     /// Whether edges are smoothed by extra rays (colour only; depth, flow and labels always belong to the pixel's centre).
     pub smooth_edges: bool,
 }
@@ -52,6 +54,7 @@ impl Default for DriveOptions {
             exposure: true,
             origin: [0.0; 3],
             traffic: 1.0,
+            zoom: [1.0; 2],
             smooth_edges: true,
         }
     }
@@ -113,6 +116,8 @@ impl DriveOptions {
         rule(self.stagger_sec.abs() <= 1.0, "stagger_sec", self.stagger_sec.to_string(), "-1 to 1")?;
         rule(self.noise >= 0.0 && self.noise <= 64.0, "noise", self.noise.to_string(), "0 to 64")?;
         rule(self.origin.iter().all(|x| x.abs() <= 1e9), "origin", format!("{:?}", self.origin), "within 1e9 m of 0")?;
+        let zoom = |z: &f32| *z >= 0.1 && *z <= 10.0;
+        rule(self.zoom.iter().all(zoom), "zoom", format!("{:?}", self.zoom), "0.1 to 10")?;
         rule(self.traffic >= 0.0 && self.traffic <= 3.0, "traffic", self.traffic.to_string(), "0 to 3")?;
         if self.seconds * self.rate_hz <= FRAMES_MAX as f64 {
             return Ok(());
@@ -139,6 +144,7 @@ mod tests {
             ("noise", DriveOptions { noise: -1.0, ..Default::default() }),
             ("origin", DriveOptions { origin: [0.0, f64::NAN, 0.0], ..Default::default() }),
             ("traffic", DriveOptions { traffic: 4.0, ..Default::default() }),
+            ("zoom", DriveOptions { zoom: [1.0, f32::NAN], ..Default::default() }),
         ];
         for (name, options) in bad {
             assert!(options.check().unwrap_err().to_string().contains(name), "{name}");

@@ -46,7 +46,8 @@ pub(crate) fn rig(options: &DriveOptions) -> Vec<DriveCamera> {
     let mut camera = |&(name, yaw, fov, place): &(&str, f64, f32, [f64; 2])| {
         let fov = fov + dice.range32(-1.5, 2.0);
         let mut intrinsics = Intrinsics::from_fov(fov, options.width, options.height);
-        intrinsics.fy *= dice.range32(0.995, 1.005);
+        intrinsics.fx *= options.zoom[0];
+        intrinsics.fy *= options.zoom[1] * dice.range32(0.995, 1.005);
         intrinsics.cx += options.width as f32 * dice.range32(-0.01, 0.01);
         intrinsics.cy += options.height as f32 * dice.range32(-0.02, 0.02);
         let yaw = (yaw + dice.range(-0.5, 0.5)).to_radians();
