@@ -43,7 +43,7 @@ pub struct RecordedPicture<'a> {
 impl RecordedPicture<'_> {
     fn check(&self) -> Result<(), TrainError> {
         let Intrinsics { width, height, .. } = self.intrinsics;
-        let pixels = width.checked_mul(height).unwrap_or(usize::MAX);
+        let pixels = width.saturating_mul(height);
         let wrong = |what: &str, got: usize| {
             Err(TrainError::Source(format!("a recorded picture of {width}x{height} pixels has {got} {what}")))
         };

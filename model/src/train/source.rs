@@ -79,8 +79,9 @@ impl RecordingOptions {
         };
         let names: Vec<String> = self.bags.iter().map(name).collect();
         let to = self.to_sec.map_or_else(|| "the end".into(), |to| format!("{to} s"));
+        let drives = if self.share < 1.0 { "" } else { "; no drives" };
         format!(
-            "{:.0} % of the batches from recordings ({}, {} s to {to}), self-supervised where they have no ground truth",
+            "{:.0} % of the batches from recordings ({}, {} s to {to}), self-supervised where they have no ground truth{drives}",
             100.0 * self.share,
             names.join(", "),
             self.from_sec
