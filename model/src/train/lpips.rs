@@ -53,7 +53,8 @@ impl FeatureNetwork {
     pub fn load(path: &Path, device: &Device) -> std::result::Result<Self, TrainError> {
         let bad = |reason: String| TrainError::Source(format!("feature network {}: {reason}", path.display()));
         let tensors = candle_core::safetensors::load(path, &Device::Cpu).map_err(|e| bad(e.to_string()))?;
-        Self::new(&tensors, device).map_err(|e| bad(e.to_string()))
+        // The first line: a backtrace may follow where one was asked for.
+        Self::new(&tensors, device).map_err(|e| bad(e.to_string().lines().next().unwrap_or_default().to_owned()))
     }
 
     /// From named tensors.
@@ -313,7 +314,7 @@ mod tests {
                 let x = t["features.5.weight"].clone();
                 t.insert("features.2.weight".into(), x);
             },
-            "features.2.bias has shape",
+            "lin0.model.1.weight has shape",
         );
         refuse(
             &|t| {

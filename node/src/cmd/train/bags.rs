@@ -331,7 +331,7 @@ fn ground(k: &Intrinsics, base_from_camera: &glam::DQuat) -> Vec<SkyLabel> {
     let below = -GROUND_BELOW_DEG.to_radians().sin();
     let pixel = |i: usize| {
         let ray = k.ray((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
-        let up = (*base_from_camera * glam::Vec3::from(ray).as_dvec3().normalize()).z;
+        let up = (*base_from_camera * ray.as_dvec3().normalize()).z;
         if up < below { SkyLabel::Surface } else { SkyLabel::Unknown }
     };
     (0..k.width * k.height).map(pixel).collect()
