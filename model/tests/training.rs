@@ -45,21 +45,21 @@ fn train(trainer: &mut Trainer, steps: u64) -> Vec<f64> {
 fn resumed_training_is_the_same_bytes() {
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name);
-    let mut whole = trainer(options(10));
-    let losses = train(&mut whole, 10);
+    let mut whole = trainer(options(50));
+    let losses = train(&mut whole, 50);
     assert!(losses.iter().all(|x| x.is_finite()));
     whole.save_checkpoint(&path("whole")).unwrap();
 
-    let mut half = trainer(options(10));
-    train(&mut half, 5);
+    let mut half = trainer(options(50));
+    train(&mut half, 25);
     half.save_checkpoint(&path("half")).unwrap();
     drop(half);
     let mut rest = Trainer::resume(&path("half"), &Device::Cpu).unwrap();
-    assert_eq!(rest.steps_done(), 5);
-    assert_eq!(train(&mut rest, 5), losses[5..]);
+    assert_eq!(rest.steps_done(), 25);
+    assert_eq!(train(&mut rest, 25), losses[25..]);
     rest.save_checkpoint(&path("rest")).unwrap();
     let read = |name: &str| std::fs::read(path(name)).unwrap();
-    assert!(read("whole") == read("rest"), "10 steps differ from 5 + 5");
+    assert!(read("whole") == read("rest"), "50 steps differ from 25 + 25");
     assert!(read("whole") != read("half"));
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 3, "temporary files are left");
 }
@@ -85,6 +85,12 @@ fn what_is_not_a_number_ends_the_run_by_name() {
         Err(TrainError::NonFinite { step: 1, tensor, batch_seed: 5, .. }) => assert_eq!(tensor, "loss flow"),
         other => panic!("{other:?}"),
     }
+    let dir = tempfile::tempdir().unwrap();
+    trainer.save_checkpoint(&dir.path().join("stopped.ckpt")).unwrap();
+    let mut again = Trainer::resume(&dir.path().join("stopped.ckpt"), &Device::Cpu).unwrap();
+    assert_eq!(again.steps_done(), 1);
+    assert!(again.step(&clip).is_err());
+    assert!(train(&mut again, 1)[0].is_finite());
     for (name, x) in trainer.weights(false).unwrap() {
         let values = |x: &candle_core::Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
         assert_eq!(values(&x), values(&before[&name]), "{name}");

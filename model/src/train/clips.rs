@@ -217,7 +217,7 @@ impl Shot {
         self.frame.rgb.iter().map(|&x| f32::from(x) / 127.5 - 1.0).collect()
     }
 
-    fn clip(shots: &[Vec<Self>], timespan_sec: f64) -> Result<ClipBatch, ModelError> {
+    pub(super) fn clip(shots: &[Vec<Self>], timespan_sec: f64) -> Result<ClipBatch, ModelError> {
         let pictures: Vec<Vec<Vec<f32>>> = shots.iter().map(|row| row.iter().map(Self::colors).collect()).collect();
         let views: Vec<Vec<ViewInput<'_>>> = shots
             .iter()

@@ -41,6 +41,9 @@ pub enum TrainError {
         /// What is wrong with it.
         reason: String,
     },
+    /// A recording, or a file a loss needs, that cannot be used.
+    #[error("{0}")]
+    Source(String),
     /// A thread that made samples is gone.
     #[error("the threads that make training clips have stopped")]
     Loader,

@@ -14,6 +14,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::clips::{ClipOptions, ClipPlan, TrainClip};
 use super::error::TrainError;
+use super::source::Batches;
 use crate::config::ModelConfig;
 
 /// Which samples.
@@ -70,6 +71,11 @@ impl DataOptions {
         }
     }
 
+    /// The number of target times of batch `index`.
+    pub(super) fn targets(&self, index: u64) -> usize {
+        if index < self.targets_from { 0 } else { self.clips.targets }
+    }
+
     /// Batch `index` of the run.
     pub fn batch(&self, index: u64, config: &ModelConfig) -> Result<TrainClip, TrainError> {
         self.batch_with(index, config, &Kept::default())
@@ -77,7 +83,7 @@ impl DataOptions {
 
     fn batch_with(&self, index: u64, config: &ModelConfig, kept: &Kept) -> Result<TrainClip, TrainError> {
         let cameras = self.cameras(index);
-        let targets = if index < self.targets_from { 0 } else { self.clips.targets };
+        let targets = self.targets(index);
         let clips = ClipOptions { cameras, targets, ..self.clips };
         let samples = self.samples(index);
         let lock = || kept.lock().unwrap_or_else(PoisonError::into_inner);
@@ -101,6 +107,15 @@ impl DataOptions {
     }
 }
 
+/// What [`Batches::batch_with`] keeps from one batch to the next.
+pub(super) type KeptClips = Kept;
+
+impl Batches for DataOptions {
+    fn batch_with(&self, index: u64, config: &ModelConfig, kept: &KeptClips) -> Result<TrainClip, TrainError> {
+        DataOptions::batch_with(self, index, config, kept)
+    }
+}
+
 type Made = Result<TrainClip, TrainError>;
 
 /// Makes batches ahead.
@@ -112,7 +127,7 @@ pub struct Loader {
 impl Loader {
     /// Starts at batch `first` with `threads` threads (0: as many as there are cores, at most 4). They end when the
     /// loader is dropped.
-    pub fn new(options: DataOptions, config: Arc<ModelConfig>, first: u64, threads: usize) -> Self {
+    pub fn new(options: impl Batches + Clone + 'static, config: Arc<ModelConfig>, first: u64, threads: usize) -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from).min(4);
         let threads = if threads == 0 { cores } else { threads };
         let kept = Arc::new(Kept::default());

@@ -9,6 +9,7 @@ use super::losses::RenderLossOptions;
 use super::muon::Optimizer;
 use super::pixel::PixelLossOptions;
 use super::schedule::Schedule;
+use super::source::RecordingOptions;
 
 /// What the network is taught by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -54,6 +55,12 @@ pub struct TrainOptions {
     /// First step of [`Stage::Both`] that draws; before it only the pixels' truth is used.
     #[serde(default)]
     pub render_from: u64,
+    /// Recordings clips are cut from; none: procedural drives only.
+    #[serde(default)]
+    pub recordings: Option<RecordingOptions>,
+    /// File of the feature network of the perceptual term; none: the structure term stands in for it.
+    #[serde(default)]
+    pub features: Option<String>,
     /// How many times each clip is shown.
     #[serde(default = "once")]
     pub reuse: u64,
@@ -86,6 +93,8 @@ impl TrainOptions {
             clips: ClipOptions::default(),
             one_camera_steps: 0,
             render_from: 0,
+            recordings: None,
+            features: None,
             reuse: 1,
         }
     }
@@ -96,6 +105,7 @@ impl TrainOptions {
             if ok { Ok(()) } else { Err(TrainError::Option { name, value: value.to_string(), allowed }) }
         };
         let unit = 0.0..1.0;
+        self.recordings.as_ref().map_or(Ok(()), RecordingOptions::check)?;
         rule((1..=4096).contains(&self.batch), "batch", self.batch as f64, "1 to 4096")?;
         if self.stage != Stage::Pixel {
             rule((1..=10).contains(&self.clips.targets), "targets", self.clips.targets as f64, "1 to 10")?;
@@ -134,6 +144,22 @@ impl TrainOptions {
         rule(p.footprint_px > 0.0, "footprint_px", p.footprint_px, "more than 0")
     }
 
+    /// What the perceptual term of the render stage is computed with, where there is one.
+    fn perceptual(&self) -> Option<String> {
+        let RenderLossOptions { structure, structure_from_step: from, .. } = self.render;
+        if self.stage == Stage::Pixel || structure == 0.0 || from >= self.schedule.steps {
+            return None;
+        }
+        let kind = match &self.features {
+            Some(path) => {
+                let name = std::path::Path::new(path).file_name();
+                format!("LPIPS with {}", name.map_or_else(|| "a feature network".into(), |n| n.to_string_lossy()))
+            }
+            None => "structure term standing in for LPIPS".to_owned(),
+        };
+        Some(format!("{kind} from step {from}"))
+    }
+
     /// One line on what weights trained so have seen, for their metadata.
     pub fn describe(&self) -> String {
         let mut labels = Vec::new();
@@ -150,6 +176,8 @@ impl TrainOptions {
             };
             labels.push(format!("render stage ({depth}, no flow labels{from})"));
         }
+        labels.extend(self.perceptual());
+        labels.extend(self.recordings.as_ref().map(RecordingOptions::describe));
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(

@@ -70,11 +70,12 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
         }
         Ok(())
     };
+    let measured = truth.measured()?;
     if options.log_depth > 0.0 {
-        // Sky pixels have no depth; the one put there only keeps the logarithm finite.
-        let known = (&truth.distance + &truth.sky)?;
+        // Where there is no depth, the one put there only keeps the logarithm finite.
+        let known = (&truth.distance + measured.affine(-1.0, 1.0)?)?;
         let error = (output.depths.log()? - known.log()?)?.abs()?;
-        add("log_depth", options.log_depth, masked_mean(&error, &surface)?)?;
+        add("log_depth", options.log_depth, masked_mean(&error, &measured)?)?;
     }
     if options.depth > 0.0 {
         add("pixel_depth", options.depth, depth_loss(&output.depths, &truth.distance)?)?;
@@ -86,12 +87,14 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
     if options.opacity > 0.0 {
         // The probability given to what is there.
         let right = ((&output.opacities * surface.affine(2.0, -1.0)?)? + &truth.sky)?;
-        add("opacity", options.opacity, Some(right.affine(1.0 - EPS, EPS)?.log()?.neg()?.mean_all()?))?;
+        let surprise = right.affine(1.0 - EPS, EPS)?.log()?.neg()?;
+        add("opacity", options.opacity, masked_mean(&surprise, &truth.sky_known)?)?;
     }
     if options.scale > 0.0 {
-        let wanted = footprint(clip, options.footprint_px, output.config.max_scale)?.log()?.unsqueeze(D::Minus1)?;
+        let wanted =
+            footprint(clip, &measured, options.footprint_px, output.config.max_scale)?.log()?.unsqueeze(D::Minus1)?;
         let error = output.scales.log()?.broadcast_sub(&wanted)?.abs()?.mean(D::Minus1)?;
-        add("scale", options.scale, masked_mean(&error, &surface)?)?;
+        add("scale", options.scale, masked_mean(&error, &measured)?)?;
     }
     if options.sky_color > 0.0 {
         add("sky_color", options.sky_color, sky_color_loss(output, clip)?)?;
@@ -101,7 +104,8 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
         add("velocity", 1.0, Some(velocity_loss(&velocities, options.velocity)?))?;
     }
     if options.flow > 0.0 {
-        let weights = (&surface * truth.moving.affine(options.moving_weight - 1.0, 1.0)?)?;
+        let labelled = (&surface * &truth.flow_known)?;
+        let weights = (labelled * truth.moving.affine(options.moving_weight - 1.0, 1.0)?)?;
         let share = options.flow / velocities.len() as f64;
         let mut sum: Option<Tensor> = None;
         for v in velocities {
@@ -140,13 +144,13 @@ pub(super) fn exposed(output: &ClipOutput, colors: &Tensor) -> Result<Tensor, Mo
     Ok(exposed.transpose(1, 2)?.contiguous()?)
 }
 
-/// `(b, t, v, h, w)`: `footprint_px` pixels at the true z-depth, metres, at most `max_scale`; 1 in the sky.
-fn footprint(clip: &TrainClip, footprint_px: f64, max_scale: f64) -> Result<Tensor, ModelError> {
+/// `(b, t, v, h, w)`: `footprint_px` pixels at the true z-depth, metres, at most `max_scale`; 1 where it is unknown.
+fn footprint(clip: &TrainClip, measured: &Tensor, footprint_px: f64, max_scale: f64) -> Result<Tensor, ModelError> {
     let truth = &clip.context_truth;
     let focal = |i: usize| clip.context.intrinsics.narrow(3, i, 1)?.narrow(4, i, 1);
     let focal = ((focal(0)? + focal(1)?)? * 0.5)?;
     let metres = (truth.depth.broadcast_div(&focal)? * footprint_px)?.minimum(max_scale)?;
-    Ok((metres + &truth.sky)?)
+    Ok((metres * measured)?.add(&measured.affine(-1.0, 1.0)?)?)
 }
 
 fn sky_color_loss(output: &ClipOutput, clip: &TrainClip) -> Result<Option<Tensor>, ModelError> {

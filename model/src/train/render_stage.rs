@@ -4,7 +4,8 @@ use candle_core::{D, Tensor};
 use storm_render::View;
 
 use super::clips::TrainClip;
-use super::losses::{RenderLossOptions, Rendered, Target, Terms, render_losses};
+use super::losses::{RenderLossOptions, Rendered, Target, Terms, channel_last, masked_mean, render_losses};
+use super::lpips::FeatureNetwork;
 use super::pixel::velocities;
 use super::raster::{DRAWN, SharedRenderer, draw};
 use super::truth::Truth;
@@ -15,22 +16,43 @@ use crate::error::ModelError;
 use crate::network::ClipOutput;
 use crate::rays::Rays;
 
-/// All terms of a batch whose clips have target pictures.
+/// All terms of a batch whose clips have target pictures. With `features`, they take the structure term's place, with its
+/// weight and from its step on.
 pub fn render_stage_losses(
     output: &ClipOutput,
     clip: &TrainClip,
     renderer: &SharedRenderer,
     options: &RenderLossOptions,
+    features: Option<&FeatureNetwork>,
     step: u64,
 ) -> Result<Terms, ModelError> {
     let Some((target, truth)) = &clip.target else {
         return Err(ModelError::Input("the clips have no target pictures".into()));
     };
-    let Truth { depth, sky, .. } = truth;
+    let Truth { depth, sky, sky_known, .. } = truth;
     let rendered = draw_targets(output, target, renderer)?;
     let depth = (options.depth > 0.0).then(|| depth.clone());
-    let target = Target { image: target.image.clone(), depth, sky: Some(sky.clone()) };
-    render_losses(&rendered, &target, &velocities(output), options, step)
+    let labelled = truth.sky_labelled()?;
+    let whole = labelled == 1.0;
+    let target = Target { image: target.image.clone(), depth, sky: whole.then(|| sky.clone()) };
+    // The stand-in makes way for a feature network.
+    let structure = if features.is_some() { 0.0 } else { options.structure };
+    let stood_in = RenderLossOptions { structure, ..*options };
+    let mut terms = render_losses(&rendered, &target, &velocities(output), &stood_in, step)?;
+    if let Some(features) = features
+        && options.structure > 0.0
+        && step >= options.structure_from_step
+    {
+        let distance = features.distance(&rendered.image, &channel_last(&target.image)?)?;
+        terms.push("lpips", (distance * options.structure)?);
+    }
+    if labelled > 0.0 && !whole && options.sky_opacity > 0.0 {
+        let error = (&rendered.alpha - sky.affine(-1.0, 1.0)?)?.abs()?;
+        if let Some(loss) = masked_mean(&error, sky_known)? {
+            terms.push("sky_opacity", (loss * options.sky_opacity)?);
+        }
+    }
+    Ok(terms)
 }
 
 /// What the network's windows look like from the target views, as [`crate::Scene::render`] draws them.

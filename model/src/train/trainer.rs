@@ -12,6 +12,7 @@ use super::clips::TrainClip;
 use super::error::TrainError;
 use super::loader::DataOptions;
 use super::losses::Terms;
+use super::lpips::FeatureNetwork;
 use super::options::{Stage, TrainOptions};
 use super::pixel::{PixelLossOptions, pixel_losses};
 use super::raster::SharedRenderer;
@@ -51,6 +52,7 @@ pub struct Trainer {
     frozen: Tensors,
     model: Storm,
     renderer: SharedRenderer,
+    features: Option<Arc<FeatureNetwork>>,
     step: u64,
 }
 
@@ -90,12 +92,18 @@ impl Trainer {
         let config = Arc::new(model.config().clone());
         let raster = CpuRasterizer::new(config.raster_settings()).map_err(|e| ModelError::Render(e.to_string()))?;
         let renderer: SharedRenderer = Arc::new(Mutex::new(raster));
-        Ok(Self { config, options, device: device.clone(), slots, vars, frozen, model, renderer, step })
+        Ok(Self { config, options, device: device.clone(), slots, vars, frozen, model, renderer, features: None, step })
     }
 
     /// Draws with another renderer from now on.
     pub fn set_renderer(&mut self, renderer: SharedRenderer) {
         self.renderer = renderer;
+    }
+
+    /// Uses a feature network for the perceptual term from now on; `name` goes into checkpoints and metadata.
+    pub fn set_features(&mut self, name: &str, features: FeatureNetwork) {
+        self.options.features = Some(name.to_owned());
+        self.features = Some(Arc::new(features));
     }
 
     /// The network's configuration.
@@ -154,8 +162,7 @@ impl Trainer {
     /// Trains on one batch.
     ///
     /// # Errors
-    /// [`TrainError::NonFinite`] names the step and the tensor; the weights are then still those before the step (except
-    /// where it is a weight).
+    /// [`TrainError::NonFinite`] names the step and the tensor; the weights are then still those before the step.
     pub fn step(&mut self, clip: &TrainClip) -> Result<StepReport, TrainError> {
         let start = Instant::now();
         let moved;
@@ -194,11 +201,11 @@ impl Trainer {
         let TrainOptions { average_decay: decay, adam, optimizer, .. } = self.options;
         let gradient_norm =
             adamw::step(&mut self.slots, &gradients, self.step, learning_rate, decay, optimizer, &adam)?;
+        if let Some((name, bad)) = self.slots.iter().find_map(Slot::spoiled) {
+            self.undo()?;
+            return Err(self.non_finite(format!("weight {name}"), bad));
+        }
         for (var, slot) in self.vars.iter().zip(&self.slots) {
-            let bad = slot.weight.iter().filter(|x| !x.is_finite()).count();
-            if bad > 0 {
-                return Err(self.non_finite(format!("weight {}", slot.name), bad));
-            }
             var.set(&Tensor::from_slice(&slot.weight, &slot.shape[..], &self.device)?)?;
         }
         let step = self.step;
@@ -214,18 +221,32 @@ impl Trainer {
     }
 
     fn losses(&self, output: &crate::ClipOutput, clip: &TrainClip) -> Result<Terms, ModelError> {
+        let features = self.features.as_deref();
+        if let (Some(name), None) = (&self.options.features, features) {
+            return Err(ModelError::Input(format!("the run was started with feature network {name}; give it again")));
+        }
         match self.options.stage_at(self.step) {
             Stage::Pixel => pixel_losses(output, clip, &self.options.pixel),
-            Stage::Render => render_stage_losses(output, clip, &self.renderer, &self.options.render, self.step),
+            Stage::Render => {
+                render_stage_losses(output, clip, &self.renderer, &self.options.render, features, self.step)
+            }
             Stage::Both => {
                 // The velocity regulariser is in the paper's losses already.
                 let pixel = PixelLossOptions { velocity: 0.0, ..self.options.pixel };
                 let mut terms = pixel_losses(output, clip, &pixel)?;
                 let render = &self.options.render;
-                terms.extend(render_stage_losses(output, clip, &self.renderer, render, self.step)?);
+                terms.extend(render_stage_losses(output, clip, &self.renderer, render, features, self.step)?);
                 Ok(terms)
             }
         }
+    }
+
+    /// The weights before an update that spoiled some. Moments and averages that were spoiled start anew.
+    fn undo(&mut self) -> Result<(), TrainError> {
+        for (var, slot) in self.vars.iter().zip(&mut self.slots) {
+            slot.restore(var.flatten_all()?.to_vec1()?);
+        }
+        Ok(())
     }
 
     fn non_finite(&self, tensor: String, count: usize) -> TrainError {

@@ -1,6 +1,6 @@
 //! Ground truth of a clip as tensors, and samples of its sky.
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 use glam::DMat3;
 
 use super::clips::Shot;
@@ -24,6 +24,26 @@ pub struct Truth {
     pub sky: Tensor,
     /// 1 where the surface moves.
     pub moving: Tensor,
+    /// 1 where `sky` is a label, 0 where nobody said.
+    pub sky_known: Tensor,
+    /// 1 where `flow` and `moving` are labels.
+    pub flow_known: Tensor,
+}
+
+/// Distances up to this are no measurement, metres.
+const DISTANCE_KNOWN_M: f64 = 0.01;
+
+impl Truth {
+    /// 1 where the distance to a surface is known, 0 in the sky and where nobody measured.
+    pub fn measured(&self) -> candle_core::Result<Tensor> {
+        self.distance.gt(DISTANCE_KNOWN_M)?.to_dtype(self.distance.dtype())
+    }
+
+    /// Share of the pixels whose sky label is known, 0 to 1.
+    pub fn sky_labelled(&self) -> candle_core::Result<f64> {
+        let sum = self.sky_known.sum_all()?.to_dtype(DType::F64)?.to_scalar::<f64>()?;
+        Ok(sum / self.sky_known.elem_count().max(1) as f64)
+    }
 }
 
 impl Truth {
@@ -59,6 +79,8 @@ impl Truth {
             flow: Tensor::from_vec(flow, (1, t, v, h, w, 3), &Device::Cpu)?,
             sky: plane(sky)?,
             moving: plane(moving)?,
+            sky_known: plane(vec![1.0; count])?,
+            flow_known: plane(vec![1.0; count])?,
         })
     }
 
@@ -70,6 +92,8 @@ impl Truth {
             flow: cat(|x| &x.flow)?,
             sky: cat(|x| &x.sky)?,
             moving: cat(|x| &x.moving)?,
+            sky_known: cat(|x| &x.sky_known)?,
+            flow_known: cat(|x| &x.flow_known)?,
         })
     }
 
@@ -81,6 +105,8 @@ impl Truth {
             flow: to(&self.flow)?,
             sky: to(&self.sky)?,
             moving: to(&self.moving)?,
+            sky_known: to(&self.sky_known)?,
+            flow_known: to(&self.flow_known)?,
         })
     }
 }

@@ -2,19 +2,16 @@
 
 use candle_core::{Device, Tensor};
 use serde::Serialize;
-use storm_render::View;
 use storm_render::raster::CpuRasterizer;
 
 use super::clips::{ClipOptions, ClipPlan, TrainClip};
 use super::error::TrainError;
-use super::views::views;
+use super::held_pictures::add_psnr;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
 use crate::metrics::flow::flow_scores;
-use crate::metrics::image::{Image, psnr, unit_from_signed};
 use crate::metrics::{Mean, MetricError};
 use crate::network::Storm;
-use crate::scene::Want;
 
 /// Drives for validation: held out, and none of those that final figures are reported on (which start at 10,000).
 pub const VALIDATION_SEEDS: std::ops::Range<u64> = 19_000..20_000;
@@ -127,22 +124,8 @@ fn score(
     means.moving.add(epe(&scene.gaussians.velocity_forward, &movers)?);
     means.still.add(epe(&vec![[0.0; 3]; flow.len()], &movers)?);
     debug_assert_eq!(scene.config.embed_dim, config.embed_dim);
-    let Some((target, _)) = &clip.target else { return Ok(()) };
-    let pictures = numbers(&target.image)?;
-    let (times, size) = (numbers(&target.time_sec)?, scene.shape.height * scene.shape.width);
-    let views = views(target)?;
-    let cameras = scene.shape.cameras;
-    for (t, row) in views.chunks(cameras).enumerate() {
-        let targets: Vec<(View, Option<usize>)> = row.iter().enumerate().map(|(c, v)| (*v, Some(c))).collect();
-        let drawn = scene.render(raster, &targets, times[t * cameras], Want::default())?;
-        for (c, view) in drawn.iter().enumerate() {
-            let from = (t * cameras + c) * 3 * size;
-            let want: Vec<f32> =
-                (0..3 * size).map(|i| unit_from_signed(pictures[from + (i % 3) * size + i / 3])).collect();
-            let got: Vec<f32> = view.color.iter().flatten().map(|&x| unit_from_signed(x)).collect();
-            let image = |values| Image { width: view.width, height: view.height, channels: 3, values };
-            means.psnr.add(psnr(&image(&got), &image(&want), None).map_err(metric)?);
-        }
+    match &clip.target {
+        Some((target, _)) => add_psnr(&scene, target, raster, &mut means.psnr),
+        None => Ok(()),
     }
-    Ok(())
 }

@@ -1,6 +1,11 @@
-//! `storm train`: makes weights from procedural drives.
+//! `storm train`: makes weights from procedural drives and recordings.
 
+mod ablations;
+mod bags;
 mod curves;
+mod cuts;
+mod recordings;
+mod variants;
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -17,13 +22,25 @@ use tracing::info;
 
 use super::{Outcome, UsageError, interrupt, progress_bar};
 use curves::Curves;
+use recordings::{RecordingArgs, Recordings};
+use variants::VariantArgs;
 
 /// Target times drawn for validation.
 const VALIDATION_TARGETS: usize = 2;
 
 /// Arguments of `storm train`.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Clone, clap::Args)]
 pub struct Args {
+    #[command(flatten)]
+    recorded: RecordingArgs,
+    #[command(flatten)]
+    variant: VariantArgs,
+    /// Train the grid of the paper's ablations, --steps each, and write table and picture to --out.
+    #[arg(long, conflicts_with_all = ["weights", "resume", "per_frame"])]
+    ablations: bool,
+    /// Save and end at this step of the run; --resume goes on there.
+    #[arg(long)]
+    stop_at: Option<u64>,
     /// Architecture of a new network.
     #[arg(long, default_value = "tiny", conflicts_with_all = ["weights", "resume"])]
     preset: String,
@@ -119,9 +136,12 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     // SAFETY: the command line has been read and the log started; no other thread runs yet.
     unsafe { storm_model::ops::set_up_training() };
     let device = device(&args.device)?;
+    if args.ablations {
+        return ablations::run(args, &device, progress);
+    }
     let mut trainer = start(args, &device)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make folder {}", args.out.display()))?;
-    let total = trainer.options().schedule.steps;
+    let total = trainer.options().schedule.steps.min(args.stop_at.unwrap_or(u64::MAX));
     info!(
         "{}: {} weights, step {} of {total}; {}",
         trainer.config().describe(),
@@ -130,7 +150,12 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         trainer.options().describe()
     );
     let mut curves = Curves::open(&args.out, trainer.steps_done())?;
-    let mut loader = Loader::new(trainer.data(), trainer.config().clone(), trainer.steps_done(), args.loader_threads);
+    let mut recordings = Recordings::open(&mut trainer, &args.out, &device)?;
+    if trainer.steps_done() == 0 {
+        recordings.score(&Storm::new(trainer.config(), &trainer.weights(true)?)?, 0, &device)?;
+    }
+    let data = recordings.data(&trainer);
+    let mut loader = Loader::new(data, trainer.config().clone(), trainer.steps_done(), args.loader_threads);
     let stop = interrupt::stop_flag();
     let begin = Instant::now();
     let mut saved = Instant::now();
@@ -166,7 +191,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         bar.set_message(format!("loss {:.4}, {rate:.1} samples/s,", report.total));
         bar.set_position(done);
         if args.validate_every > 0 && done.is_multiple_of(args.validate_every) && done < total {
-            check(args, &trainer, &device, &mut curves)?;
+            check(args, &trainer, &device, &mut curves, &mut recordings)?;
         }
         if saved.elapsed() >= every {
             save(args, &trainer)?;
@@ -177,7 +202,12 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let done = trainer.steps_done();
     let seconds = begin.elapsed().as_secs_f64();
     save(args, &trainer)?;
-    check(args, &trainer, &device, &mut curves)?;
+    if stop.load(Ordering::Relaxed) {
+        // Whoever sent the signal does not wait for error figures.
+        info!("stopped at step {done}; go on with --resume {}", args.out.join("last.ckpt").display());
+    } else {
+        check(args, &trainer, &device, &mut curves, &mut recordings)?;
+    }
     let samples = (done - first) as f64 * trainer.options().batch as f64;
     println!(
         "{} steps, {seconds:.0} s, {:.2} samples/s, {:.0} % of the time waiting for clips",
@@ -204,6 +234,7 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         None => {
             let config = ModelConfig::preset(&args.preset).map_err(|e| UsageError(e.to_string()))?;
             let config = ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config };
+            let config = args.variant.configure(config);
             let tensors = untrained(&config, args.seed, &Device::Cpu)?;
             (config, tensors, format!("untrained {}, seed {}", args.preset, args.seed))
         }
@@ -248,6 +279,8 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         options.pixel.velocity = x;
         options.render.velocity = x;
     }
+    args.variant.apply(&mut options);
+    args.recorded.apply(&mut options)?;
     options.check().map_err(|e| UsageError(e.to_string()))?;
     Ok(Trainer::new(&config, &tensors, options, device)?)
 }
@@ -262,12 +295,19 @@ fn save(args: &Args, trainer: &Trainer) -> Result<()> {
     Ok(())
 }
 
-fn check(args: &Args, trainer: &Trainer, device: &Device, curves: &mut Curves) -> Result<()> {
+fn check(
+    args: &Args,
+    trainer: &Trainer,
+    device: &Device,
+    curves: &mut Curves,
+    recordings: &mut Recordings,
+) -> Result<()> {
+    let model = Storm::new(trainer.config(), &trainer.weights(true)?)?;
+    recordings.score(&model, trainer.steps_done(), device)?;
     if args.validate_drives == 0 {
         return Ok(());
     }
     let options = ClipOptions { targets: VALIDATION_TARGETS, ..trainer.options().clips };
-    let model = Storm::new(trainer.config(), &trainer.weights(true)?)?;
     let v = validate(&model, &options, args.validate_drives, device)?;
     info!("step {}: {}", trainer.steps_done(), curves::describe(&v));
     curves.validation(trainer.steps_done(), &v)?;

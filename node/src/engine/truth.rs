@@ -78,7 +78,7 @@ pub fn unit(bytes: &[u8]) -> Vec<f32> {
 }
 
 /// `data` at the centres of a `width x height` picture's pixels; `None` when its length does not fit its size.
-fn sample<T: Copy>(data: &[T], image: &TruthImage, (width, height): (usize, usize)) -> Option<Vec<T>> {
+pub(crate) fn sample<T: Copy>(data: &[T], image: &TruthImage, (width, height): (usize, usize)) -> Option<Vec<T>> {
     if data.len() != image.width * image.height || data.is_empty() {
         return None;
     }

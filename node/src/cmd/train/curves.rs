@@ -11,7 +11,7 @@ use storm_model::train::{StepReport, Validation};
 use crate::output::atomic::write_bytes;
 
 /// Every loss term there is; those a run does not have stay empty.
-const TERMS: [&str; 17] = [
+const TERMS: [&str; 18] = [
     "rgb",
     "log_depth",
     "depth",
@@ -24,6 +24,7 @@ const TERMS: [&str; 17] = [
     "flow",
     "groups",
     "structure",
+    "lpips",
     "sky_opacity",
     "sky_depth",
     "opaque",
@@ -49,7 +50,7 @@ const FIGURES: [&str; 8] = [
 const POINTS: usize = 400;
 
 /// Rows of numbers, one file.
-struct Table {
+pub(super) struct Table {
     path: PathBuf,
     file: BufWriter<File>,
     /// Step, then one value per column.
@@ -58,7 +59,7 @@ struct Table {
 
 impl Table {
     /// Opens a table and drops what an earlier run wrote from step `first` on (it is trained again).
-    fn open(path: PathBuf, columns: &[&str], first: u64) -> Result<Self> {
+    pub fn open(path: PathBuf, columns: &[&str], first: u64) -> Result<Self> {
         let text = std::fs::read_to_string(&path).unwrap_or_default();
         let row = |line: &str| {
             let mut cells = line.split(',');
@@ -75,7 +76,8 @@ impl Table {
         Ok(Self { path, file: BufWriter::new(file), rows })
     }
 
-    fn push(&mut self, step: u64, values: Vec<Option<f64>>) -> Result<()> {
+    /// Adds a row.
+    pub fn push(&mut self, step: u64, values: Vec<Option<f64>>) -> Result<()> {
         self.file
             .write_all(line(step, &values).as_bytes())
             .and_then(|()| self.file.flush())
@@ -156,7 +158,7 @@ impl Curves {
 
     /// Draws the picture.
     fn draw(&mut self) -> Result<()> {
-        let losses: Vec<(&str, Vec<(f64, f64)>)> = TERMS[..15]
+        let losses: Vec<(&str, Vec<(f64, f64)>)> = TERMS[..16]
             .iter()
             .enumerate()
             .map(|(k, name)| (*name, self.losses.series(k)))
