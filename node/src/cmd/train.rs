@@ -4,6 +4,7 @@ mod ablations;
 mod bags;
 mod curves;
 mod cuts;
+mod recipe;
 mod recordings;
 mod variants;
 
@@ -13,15 +14,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use candle_core::Device;
-use storm_model::train::{
-    ClipOptions, Loader, Optimizer, Stage, TrainError, TrainOptions, Trainer, provenance, validate,
-};
+use storm_model::train::{ClipOptions, Loader, TrainError, TrainOptions, Trainer, provenance, validate};
 use storm_model::weights::{self, SavedType, save_safetensors, untrained};
 use storm_model::{ModelConfig, Storm};
 use tracing::info;
 
 use super::{Outcome, UsageError, interrupt, progress_bar};
 use curves::Curves;
+use recipe::{RecipeArgs, Start};
 use recordings::{RecordingArgs, Recordings};
 use variants::VariantArgs;
 
@@ -35,6 +35,8 @@ pub struct Args {
     recorded: RecordingArgs,
     #[command(flatten)]
     variant: VariantArgs,
+    #[command(flatten)]
+    recipe: RecipeArgs,
     /// Train the grid of the paper's ablations, --steps each, and write table and picture to --out.
     #[arg(long, conflicts_with_all = ["weights", "resume", "per_frame"])]
     ablations: bool,
@@ -59,25 +61,9 @@ pub struct Args {
     /// Clips per step.
     #[arg(long, default_value_t = 8)]
     batch: usize,
-    /// Highest learning rate [default: 4e-4, the paper's].
-    #[arg(long, default_value_t = 4e-4)]
-    lr: f64,
-    /// What moves the transformer's matrices: adamw, or muon, which learns more per sample on small budgets.
-    #[arg(long, default_value = "adamw", value_parser = ["adamw", "muon"])]
-    optimizer: String,
-    /// What to learn from. pixel: the truth of every context pixel (cheap); render: pictures drawn at other times, the
-    /// paper's; both: their sum.
-    #[arg(long, default_value = "pixel")]
-    stage: String,
     /// Train without ground-truth depth (with --stage render: from pictures and sky masks alone).
     #[arg(long)]
     no_depth_labels: bool,
-    /// Steps before the structure term of the render stage is switched on [default: 5000, the paper's].
-    #[arg(long)]
-    structure_from: Option<u64>,
-    /// Target times drawn per clip in the render stage, 1 to 10.
-    #[arg(long, default_value_t = 4)]
-    targets: usize,
     /// Train without ground-truth flow.
     #[arg(long)]
     no_flow_labels: bool,
@@ -93,18 +79,6 @@ pub struct Args {
     /// Cameras of a clip, 1 to 6.
     #[arg(long, default_value_t = 3)]
     cameras: usize,
-    /// First step of --stage both that draws pictures; before it only the pixels' truth is used.
-    #[arg(long, default_value_t = 0)]
-    render_from: u64,
-    /// Steps with one camera before all are used.
-    #[arg(long, default_value_t = 0)]
-    one_camera_steps: u64,
-    /// Vary the lenses from clip to clip and the number of cameras, for weights that meet other rigs than the drives' own.
-    #[arg(long)]
-    variety: bool,
-    /// How often each clip is shown, at least 1; driving a clip costs a quarter of learning from it.
-    #[arg(long, default_value_t = 1)]
-    reuse: u64,
     /// Stop (and save) after so many minutes.
     #[arg(long)]
     minutes: Option<f64>,
@@ -239,26 +213,20 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
             (config, tensors, format!("untrained {}, seed {}", args.preset, args.seed))
         }
     };
-    let mut options = TrainOptions::new(args.seed, args.steps, args.batch, args.lr);
+    let mut options = TrainOptions::new(args.seed, args.steps, args.batch, args.recipe.peak());
     options.history = history;
-    options.optimizer = if args.optimizer == "muon" { Optimizer::Muon } else { Optimizer::AdamW };
-    options.stage = match args.stage.as_str() {
-        "pixel" => Stage::Pixel,
-        "render" => Stage::Render,
-        "both" => Stage::Both,
-        other => return Err(UsageError(format!("--stage {other}: use pixel, render or both")).into()),
-    };
     options.clips = ClipOptions {
         cameras: args.cameras,
         width: config.image_width,
         height: config.image_height,
-        targets: args.targets,
         ..ClipOptions::default()
     };
-    options.one_camera_steps = args.one_camera_steps;
-    options.render_from = args.render_from;
-    options.reuse = args.reuse;
-    options.clips.variety = args.variety;
+    let from = match (args.recorded.alone(), &args.weights) {
+        (true, _) => Start::Recordings,
+        (false, Some(_)) => Start::Weights,
+        (false, None) => Start::New,
+    };
+    args.recipe.apply(&mut options, from)?;
     if let Some(x) = args.flow_weight {
         options.pixel.flow = x;
     }
@@ -268,9 +236,6 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
     if args.no_depth_labels {
         (options.pixel.depth, options.pixel.log_depth, options.pixel.scale, options.render.depth) =
             (0.0, 0.0, 0.0, 0.0);
-    }
-    if let Some(step) = args.structure_from {
-        options.render.structure_from_step = step;
     }
     if let Some(x) = args.moving_weight {
         options.pixel.moving_weight = x;

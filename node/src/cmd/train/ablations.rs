@@ -231,10 +231,10 @@ fn empty() -> Validation {
 fn table(args: &Args, results: &[(Row, Found)]) -> String {
     let names = figures(&empty()).map(|(name, _, _)| name);
     let mut text = format!(
-        "# Ablations\n\n{} steps of {} clips, stage {}, data seed {}; {} validation drives.\n\n| | | {} |\n|---|---|{}\n",
+        "# Ablations\n\n{} steps of {} clips, recipe {}, data seed {}; {} validation drives.\n\n| | | {} |\n|---|---|{}\n",
         args.steps,
         args.batch,
-        args.stage,
+        args.recipe.name(),
         args.seed,
         args.validate_drives,
         names.join(" | "),
@@ -263,7 +263,7 @@ fn write(args: &Args, results: &[(Row, Found)]) -> Result<()> {
     let report = json!({
         "steps": args.steps,
         "batch": args.batch,
-        "stage": args.stage,
+        "recipe": args.recipe.name(),
         "seed": args.seed,
         "validation_drives": args.validate_drives,
         "rows": results.iter().map(one).collect::<Vec<_>>(),

@@ -57,6 +57,11 @@ fn whole(path: &Path) -> Result<String> {
 }
 
 impl RecordingArgs {
+    /// Whether recordings are all there is to learn from.
+    pub fn alone(&self) -> bool {
+        !self.bag.is_empty() && self.bag_share.is_none_or(|share| share >= 1.0)
+    }
+
     /// Into the options of a new run.
     pub fn apply(&self, options: &mut TrainOptions) -> Result<()> {
         if let Some(path) = &self.lpips {
