@@ -209,7 +209,8 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
             let config = ModelConfig::preset(&args.preset).map_err(|e| UsageError(e.to_string()))?;
             let config = ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config };
             let config = args.variant.configure(config);
-            let tensors = untrained(&config, args.seed, &Device::Cpu)?;
+            let mut tensors = untrained(&config, args.seed, &Device::Cpu)?;
+            args.variant.settle(&mut tensors)?;
             (config, tensors, format!("untrained {}, seed {}", args.preset, args.seed))
         }
     };

@@ -85,12 +85,13 @@ mod tests {
     fn clips_start_wherever_a_context_fits() {
         let all = (0.0, f64::INFINITY);
         let (inside, outside) = cuts(&sets(51), all, &ClipOptions::default());
-        assert_eq!((inside.len(), outside.len()), (36, 0));
+        // The last one's newest set is 0.1 s early, within the tolerance.
+        assert_eq!((inside.len(), outside.len()), (37, 0));
         assert_eq!(inside[0], Cut { context: vec![0, 5, 10, 15], moments: 0..20 });
         assert_eq!(inside[35], Cut { context: vec![35, 40, 45, 50], moments: 35..51 });
-        assert!(cuts(&sets(15), all, &ClipOptions::default()).0.is_empty());
+        assert!(cuts(&sets(14), all, &ClipOptions::default()).0.is_empty());
         assert!(cuts(&[], all, &ClipOptions::default()).0.is_empty());
-        let (one, _) = cuts(&sets(16), all, &ClipOptions::default());
+        let (one, _) = cuts(&sets(15), all, &ClipOptions::default());
         assert_eq!(one.len(), 1);
     }
 
@@ -105,7 +106,7 @@ mod tests {
         assert_eq!(outside.len(), 8);
         assert!(outside.iter().all(|cut| cut.context[0] >= 26), "{outside:?}");
         let (inside, outside) = cuts(&sets(51), (2.5, f64::INFINITY), &ClipOptions::default());
-        assert!(inside.iter().all(|cut| cut.context[0] >= 25) && inside.len() == 11);
+        assert!(inside.iter().all(|cut| cut.context[0] >= 25) && inside.len() == 12);
         assert!(outside.iter().all(|cut| cut.moments.end <= 25), "{outside:?}");
     }
 

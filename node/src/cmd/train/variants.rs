@@ -2,6 +2,7 @@
 
 use storm_model::ModelConfig;
 use storm_model::train::TrainOptions;
+use storm_model::weights::Tensors;
 
 /// A velocity scale at which whatever the decoder says stands still: nanometres per second.
 const STILL_MPS: f64 = 1e-9;
@@ -48,6 +49,15 @@ impl VariantArgs {
             config.velocity_scale = STILL_MPS;
         }
         config
+    }
+
+    /// The first weights' side: untrained velocities are made for their scale, so at a scale of nothing they are set to 0.
+    pub fn settle(&self, weights: &mut Tensors) -> candle_core::Result<()> {
+        let last = |name: &str| name.starts_with("motion_basis_decoder") && name.contains(".fc2.");
+        for (_, x) in weights.iter_mut().filter(|(name, _)| self.per_frame && last(name)) {
+            *x = x.zeros_like()?;
+        }
+        Ok(())
     }
 
     /// The training's side.
@@ -108,7 +118,8 @@ mod tests {
             (options.clips.width, options.clips.height, options.clips.targets) = (24, 16, 1);
             variant.apply(&mut options);
             let timesteps = options.clips.timesteps;
-            let weights = untrained(&config, 1, &Device::Cpu).unwrap();
+            let mut weights = untrained(&config, 1, &Device::Cpu).unwrap();
+            variant.settle(&mut weights).unwrap();
             let mut trainer = Trainer::new(&config, &weights, options, &Device::Cpu).unwrap();
             let clip = trainer.data().batch(0, &config).unwrap();
             assert_eq!(clip.context.image.dims()[1], timesteps);
