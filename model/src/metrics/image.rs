@@ -202,7 +202,13 @@ pub struct ImageScores {
     pub depth_rmse: Option<f64>,
     /// Metres, moving things of known depth.
     pub depth_rmse_dynamic: Option<f64>,
+    /// Metres, pixels whose true depth is at most [`LIDAR_REACH_M`].
+    pub depth_rmse_lidar: Option<f64>,
 }
+
+/// How far the lidars of driving data sets reach, metres: the paper's depth errors are over their returns, while the truth of a
+/// procedural drive goes on to the horizon.
+pub const LIDAR_REACH_M: f32 = 75.0;
 
 impl Held<'_> {
     /// All figures of this image. Regions that were not given have none.
@@ -218,6 +224,7 @@ impl Held<'_> {
         let (psnr_occupied, ssim_occupied) = region(occupied.as_deref())?;
         let (psnr_dynamic, ssim_dynamic) = region(self.dynamic)?;
         let depth_rmse_dynamic = self.dynamic.map_or(Ok(None), |mask| depth(Some(mask)))?;
+        let reached = self.depth.map(|(_, t)| t.iter().map(|&t| t <= LIDAR_REACH_M).collect::<Vec<bool>>());
         Ok(ImageScores {
             psnr,
             ssim,
@@ -227,6 +234,7 @@ impl Held<'_> {
             ssim_dynamic,
             depth_rmse: depth(None)?,
             depth_rmse_dynamic,
+            depth_rmse_lidar: depth(reached.as_deref())?,
         })
     }
 }
@@ -234,7 +242,7 @@ impl Held<'_> {
 impl ImageScores {
     /// Each figure's mean over the images that have it (the paper averages over images, not pixels).
     pub fn mean<'a>(scores: impl IntoIterator<Item = &'a ImageScores>) -> ImageScores {
-        let mut means = [Mean::default(); 8];
+        let mut means = [Mean::default(); 9];
         for s in scores {
             let figures = [
                 s.psnr,
@@ -245,20 +253,22 @@ impl ImageScores {
                 s.ssim_dynamic,
                 s.depth_rmse,
                 s.depth_rmse_dynamic,
+                s.depth_rmse_lidar,
             ];
             means.iter_mut().zip(figures).for_each(|(m, f)| m.add(f));
         }
-        let [psnr, ssim, psnr_occupied, ssim_occupied, psnr_dynamic, ssim_dynamic, depth_rmse, depth_rmse_dynamic] =
+        let [full, ssim, occupied, ssim_occupied, dynamic, ssim_dynamic, depth, depth_dynamic, depth_lidar] =
             means.map(|m| m.value());
         ImageScores {
-            psnr,
+            psnr: full,
             ssim,
-            psnr_occupied,
+            psnr_occupied: occupied,
             ssim_occupied,
-            psnr_dynamic,
+            psnr_dynamic: dynamic,
             ssim_dynamic,
-            depth_rmse,
-            depth_rmse_dynamic,
+            depth_rmse: depth,
+            depth_rmse_dynamic: depth_dynamic,
+            depth_rmse_lidar: depth_lidar,
         }
     }
 }

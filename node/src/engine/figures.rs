@@ -18,6 +18,8 @@ pub struct Figures {
     pub depth_rmse: Option<f64>,
     /// z-depth of moving pixels, metres.
     pub depth_rmse_dynamic: Option<f64>,
+    /// z-depth of pixels no deeper than 75 m, as far as lidars reach, metres.
+    pub depth_rmse_lidar: Option<f64>,
     /// End-point error of the flow on context frames, m/s.
     pub epe3d: Option<f64>,
     /// Share of points within 0.05 m/s or 5 %, 0 to 1.
@@ -46,7 +48,7 @@ pub struct Figures {
 
 impl Figures {
     /// Name, unit and value of each.
-    pub fn rows(&self) -> [(&'static str, &'static str, Option<f64>); 18] {
+    pub fn rows(&self) -> [(&'static str, &'static str, Option<f64>); 19] {
         [
             ("PSNR", "dB", self.psnr),
             ("PSNR, moving", "dB", self.psnr_dynamic),
@@ -54,6 +56,7 @@ impl Figures {
             ("SSIM, moving", "", self.ssim_dynamic),
             ("depth RMSE", "m", self.depth_rmse),
             ("depth RMSE, moving", "m", self.depth_rmse_dynamic),
+            ("depth RMSE to 75 m", "m", self.depth_rmse_lidar),
             ("EPE3D", "m/s", self.epe3d),
             ("Acc5", "", self.acc5),
             ("Acc10", "", self.acc10),
@@ -79,6 +82,7 @@ impl Figures {
             ssim_dynamic: m.ssim_dynamic,
             depth_rmse: m.depth_rmse,
             depth_rmse_dynamic: m.depth_rmse_dynamic,
+            depth_rmse_lidar: m.depth_rmse_lidar,
             ..Self::default()
         }
     }
