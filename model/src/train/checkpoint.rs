@@ -119,9 +119,7 @@ impl Trainer {
 
 /// The text on where weights come from, in a safetensors file we wrote; `None` where there is none.
 pub fn provenance(path: &Path) -> Option<String> {
-    let bytes = std::fs::read(path).ok()?;
-    let (_, metadata) = SafeTensors::read_metadata(&bytes).ok()?;
-    metadata.metadata().as_ref()?.get("provenance").cloned()
+    crate::weights::provenance(&std::fs::read(path).ok()?)
 }
 
 fn write_atomically(path: &Path, bytes: &[u8]) -> std::io::Result<()> {

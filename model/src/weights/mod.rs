@@ -19,8 +19,9 @@ pub use error::{Mismatch, WeightsError};
 pub use infer::infer_config;
 pub use init::untrained;
 pub use names::{Init, TensorSpec, tensor_specs};
+pub(crate) use safetensors::provenance;
 pub use safetensors::{SavedType, save_safetensors};
-pub use shipped::{SHIPPED_NAME, shipped};
+pub use shipped::{SHIPPED_NAME, shipped, shipped_provenance};
 
 use crate::config::ModelConfig;
 use crate::error::ModelError;

@@ -103,6 +103,12 @@ impl Source for SafetensorsFile {
     }
 }
 
+/// The text on where weights come from, in the bytes of a safetensors file we wrote; `None` where there is none.
+pub(crate) fn provenance(bytes: &[u8]) -> Option<String> {
+    let (_, metadata) = SafeTensors::read_metadata(bytes).ok()?;
+    metadata.metadata().as_ref()?.get(PROVENANCE_KEY).cloned()
+}
+
 /// Number type of a saved file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SavedType {

@@ -16,6 +16,11 @@ pub fn shipped(device: &Device) -> Result<(ModelConfig, Tensors), ModelError> {
     load_built_in(SHIPPED_NAME, BYTES, None, device)
 }
 
+/// How they were made.
+pub fn shipped_provenance() -> String {
+    super::provenance(BYTES).unwrap_or_else(|| SHIPPED_NAME.to_owned())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -29,5 +34,6 @@ mod tests {
         assert_eq!(config, ModelConfig::preset("tiny").unwrap());
         assert!(BYTES.len() <= MOST_BYTES, "{} bytes", BYTES.len());
         crate::Storm::new(&config, &tensors).unwrap();
+        assert!(shipped_provenance().contains("procedural drives"), "{}", shipped_provenance());
     }
 }

@@ -21,12 +21,15 @@ use tracing::info;
 
 use super::{Outcome, UsageError, interrupt, progress_bar};
 use curves::Curves;
-use recipe::{RecipeArgs, Start};
+use recipe::{PAPER_RATE, RecipeArgs, Start};
 use recordings::{RecordingArgs, Recordings};
 use variants::VariantArgs;
 
 /// Target times drawn for validation.
 const VALIDATION_TARGETS: usize = 2;
+
+/// What `--weights` calls the weights that ship.
+const SHIPPED: &str = "shipped";
 
 /// Arguments of `storm train`.
 #[derive(Debug, Clone, clap::Args)]
@@ -46,7 +49,7 @@ pub struct Args {
     /// Architecture of a new network.
     #[arg(long, default_value = "tiny", conflicts_with_all = ["weights", "resume"])]
     preset: String,
-    /// Start from these weights, with a fresh optimiser.
+    /// Start from these weights, or from the ones that ship (`shipped`), with a fresh optimiser.
     #[arg(long, conflicts_with = "resume")]
     weights: Option<PathBuf>,
     /// Go on exactly where this checkpoint was written; its options hold, only --out, --minutes and the reports differ.
@@ -199,6 +202,10 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         return Ok(Trainer::resume(path, device)?);
     }
     let (config, tensors, history) = match &args.weights {
+        Some(path) if path.as_os_str() == SHIPPED => {
+            let (config, tensors) = weights::shipped(&Device::Cpu)?;
+            (config, tensors, weights::shipped_provenance())
+        }
         Some(path) => {
             let (config, tensors) = weights::load(path, None, &Device::Cpu)
                 .with_context(|| format!("cannot use weights {}", path.display()))?;
@@ -214,7 +221,7 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
             (config, tensors, format!("untrained {}, seed {}", args.preset, args.seed))
         }
     };
-    let mut options = TrainOptions::new(args.seed, args.steps, args.batch, args.recipe.peak());
+    let mut options = TrainOptions::new(args.seed, args.steps, args.batch, PAPER_RATE);
     options.history = history;
     options.clips = ClipOptions {
         cameras: args.cameras,
