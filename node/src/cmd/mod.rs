@@ -6,8 +6,10 @@ mod demo;
 mod eval;
 mod info;
 mod interrupt;
+mod map;
 mod render;
 mod replay;
+mod soak;
 mod synth;
 mod train;
 
@@ -73,6 +75,8 @@ enum Command {
     Synth(synth::Args),
     /// Draw a saved map or step from any pose at any time.
     Render(render::Args),
+    /// Check a saved map, say what it holds, write it as PLY.
+    Map(map::Args),
     /// Say what a bag holds and how it would be used.
     Info(info::Args),
     /// Error figures on procedural drives that training never sees, beside simple baselines.
@@ -81,6 +85,8 @@ enum Command {
     Train(Box<train::Args>),
     /// Measure run time: the network at full size, the rasteriser, the drive, and the settings of a step.
     Bench(bench::Args),
+    /// Long procedural drives through the map and the trackers, without a network: times, memory, errors.
+    Soak(soak::Args),
     /// Print every configuration key with its default and meaning, as a YAML file ready to edit.
     Config(config::Args),
 }
@@ -95,10 +101,12 @@ impl Cli {
             Command::Replay(a) => replay::run(&a, progress),
             Command::Synth(a) => synth::run(&a, progress),
             Command::Render(a) => render::run(&a),
+            Command::Map(a) => map::run(&a),
             Command::Info(a) => info::run(&a),
             Command::Eval(a) => eval::run(&a, progress),
             Command::Train(a) => train::run(&a, progress),
             Command::Bench(a) => bench::run(&a, progress),
+            Command::Soak(a) => soak::run(&a, progress),
             Command::Config(a) => config::run(&a),
         };
         result.unwrap_or_else(|e| {

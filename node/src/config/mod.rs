@@ -100,16 +100,36 @@ section! {
 section! {
     /// The long-horizon map.
     pub struct MapConfig {
-        /// Edge of the merging voxels, metres.
-        voxel_m: f64 = 0.25,
+        /// Edge of the tiles the map is kept, put to disk and published in, metres.
+        tile_m: f64 = 16.0,
+        /// Edge of the finest merging voxels, metres; farther away, where pixels are larger, voxels are 2, 4, 8 or 16 times that.
+        voxel_m: f64 = 0.1,
+        /// Two depths along one ray are the same surface when they differ by less than this part of the distance.
+        depth_gate: f64 = 0.02,
         /// Gaussians faster than this do not enter the map, m/s.
         static_speed_mps: f64 = 1.0,
+        /// A motion group with more than this part of its Gaussians faster than that does not enter either.
+        moving_group_share: f64 = 0.5,
         /// Gaussians less opaque than this do not enter the map.
         min_opacity: f64 = 0.1,
-        /// Gaussians deeper than this in their own picture do not enter the map, metres.
-        max_depth_m: f64 = 80.0,
-        /// Hard cap on map Gaussians; the least confident go first.
-        max_gaussians: usize = 2_000_000,
+        /// Gaussians farther than this from their own camera do not enter the map, metres.
+        max_depth_m: f64 = 60.0,
+        /// Surfaces that later rays pass clearly through leave the map.
+        free_space: bool = true,
+        /// Hard cap on map Gaussians in memory; far tiles go to disk, and without `map.spill` the least confident Gaussians go.
+        max_gaussians: usize = 4_000_000,
+        /// Hard cap on the map's memory, MiB.
+        max_mb: usize = 512,
+        /// Whether far tiles may go to disk (`map/` in the results folder) and come back with the vehicle.
+        spill: bool = true,
+        /// Hard cap on the map's files, MiB; beyond it nothing more goes to disk.
+        max_disk_mb: usize = 16_384,
+        /// The map is saved this often, seconds; a killed run loses at most that much. 0: only at the end.
+        save_every_sec: f64 = 10.0,
+        /// Folder of a saved map (`map/` of a results folder) to go on from; it is copied, not changed. Empty: start anew.
+        load: String = String::new(),
+        /// Most Gaussians in map.ply and the published map; a larger map is thinned out evenly there, never in `map/`. 0: no limit.
+        max_written: usize = 5_000_000,
     }
 }
 
@@ -120,8 +140,14 @@ section! {
         min_speed_mps: f64 = 1.0,
         /// Gaussians less opaque than this start no trajectory.
         min_opacity: f64 = 0.3,
-        /// A trajectory continues at the nearest Gaussian within this distance of its predicted place, metres.
+        /// A trajectory continues at the nearest Gaussian within this distance of its predicted place, metres; more where its speed is uncertain or it is far away.
         gate_m: f64 = 0.5,
+        /// Added to the gate per metre of distance from the camera, metres.
+        gate_per_m: f64 = 0.01,
+        /// Largest gate, metres.
+        max_gate_m: f64 = 2.0,
+        /// Largest difference of colour (root mean square over the channels, 0 to 1) between a trajectory and the Gaussian that continues it.
+        max_color_step: f64 = 0.25,
         /// A trajectory without a Gaussian near its predicted place for longer than this ends, seconds.
         bridge_sec: f64 = 0.6,
         /// New trajectories start at least this far from all others, metres.
@@ -129,7 +155,31 @@ section! {
         /// Trajectories shorter than this many points are not written.
         min_points: usize = 3,
         /// Most trajectories kept alive at once.
-        max_active: usize = 5_000,
+        max_active: usize = 20_000,
+    }
+}
+
+section! {
+    /// Moving objects.
+    pub struct ObjectsConfig {
+        /// Moving Gaussians nearer than this to each other may belong to one object, metres.
+        connect_m: f64 = 0.6,
+        /// Neighbouring Gaussians whose velocities differ by less than this do (twice as much within a motion group), m/s.
+        velocity_step_mps: f64 = 1.5,
+        /// Fewest Gaussians of an object in one step.
+        min_points: usize = 5,
+        /// An object continues at a group within this distance of its predicted place plus half its size, metres.
+        gate_m: f64 = 1.0,
+        /// And with a velocity that differs by less than this, m/s.
+        velocity_gate_mps: f64 = 4.0,
+        /// An object that is not seen for longer than this ends, seconds.
+        bridge_sec: f64 = 1.0,
+        /// Steps after which an object is believed.
+        confirm_steps: usize = 3,
+        /// Most objects at once.
+        max_objects: usize = 500,
+        /// Edge of the voxels its Gaussians are merged in, metres.
+        voxel_m: f64 = 0.1,
     }
 }
 
@@ -167,6 +217,8 @@ pub struct Config {
     pub map: MapConfig,
     /// Point trajectories.
     pub tracks: TracksConfig,
+    /// Moving objects.
+    pub objects: ObjectsConfig,
     /// What is written.
     pub output: OutputConfig,
 }
@@ -181,6 +233,7 @@ impl Config {
         docs.extend(ModelConfigSection::describe("model"));
         docs.extend(MapConfig::describe("map"));
         docs.extend(TracksConfig::describe("tracks"));
+        docs.extend(ObjectsConfig::describe("objects"));
         docs.extend(OutputConfig::describe("output"));
         docs
     }

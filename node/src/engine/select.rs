@@ -1,10 +1,12 @@
 //! Which Gaussians of a scene go where: the published cloud, the map, the trackers.
 
-use glam::Vec3;
-use storm_model::scene::Scene;
+use glam::{Quat, Vec3};
+use storm_model::scene::{Affine, Scene};
 use storm_render::Gaussians;
 
 use crate::config::TracksConfig;
+use crate::map::color01;
+use crate::objects::ObjectPoint;
 use crate::rigid::Rigid;
 use crate::tracks::TrackPoint;
 
@@ -27,6 +29,7 @@ pub fn from_step(scene: &Scene, first: usize) -> std::ops::Range<usize> {
 /// The newest timestep's moving Gaussians in map coordinates.
 pub fn moving_points(scene: &Scene, first: usize, map_from_anchor: &Rigid, config: &TracksConfig) -> Vec<TrackPoint> {
     let g = &scene.gaussians;
+    let exposure = Affine::mean(&scene.affine);
     from_step(scene, first)
         .filter(|&i| speed_mps(scene, i) as f64 >= config.min_speed_mps && g.opacities[i] as f64 >= config.min_opacity)
         .map(|i| TrackPoint {
@@ -34,8 +37,42 @@ pub fn moving_points(scene: &Scene, first: usize, map_from_anchor: &Rigid, confi
             velocity_map_mps: map_from_anchor.rotation * Vec3::from(g.velocity_forward[i]).as_dvec3(),
             opacity: g.opacities[i],
             motion_id: g.motion_id(i),
+            color01: color01(&exposure.apply(g.colors[i])),
+            distance_m: scene.depths[i],
+            may_start: true,
         })
         .collect()
+}
+
+/// The newest timestep's moving Gaussians as parts of objects, in map coordinates, and their numbers within the timestep.
+pub fn object_points(
+    scene: &Scene,
+    first: usize,
+    map_from_anchor: &Rigid,
+    config: &TracksConfig,
+) -> (Vec<usize>, Vec<ObjectPoint>) {
+    let g = &scene.gaussians;
+    let exposure = Affine::mean(&scene.affine);
+    let turn = map_from_anchor.rotation.as_quat();
+    let range = from_step(scene, first);
+    let start = range.start;
+    range
+        .filter(|&i| speed_mps(scene, i) as f64 >= config.min_speed_mps && g.opacities[i] as f64 >= config.min_opacity)
+        .map(|i| {
+            let [w, x, y, z] = unit_quat(g.quats[i]);
+            let point = ObjectPoint {
+                position_map: map_from_anchor.apply(Vec3::from(g.means[i]).as_dvec3()),
+                velocity_map_mps: map_from_anchor.rotation * Vec3::from(g.velocity_forward[i]).as_dvec3(),
+                motion_id: g.motion_id(i),
+                opacity: g.opacities[i],
+                color01: color01(&exposure.apply(g.colors[i])),
+                rotation: turn * Quat::from_xyzw(x, y, z, w),
+                scale: g.scales[i].into(),
+                distance_m: scene.depths[i],
+            };
+            (i - start, point)
+        })
+        .unzip()
 }
 
 /// Indices of the Gaussians that are published: at least `min_opacity`, and at most `limit` of the most opaque (0: no

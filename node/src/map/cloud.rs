@@ -1,15 +1,21 @@
 //! The map as plain arrays, ready to be written or drawn.
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::cell::Cell;
 use super::eigen::rotation_and_scales;
+use super::voxel::level_of;
 
 /// Standard deviations below this come out as this, metres: a flat or single-point cell stays drawable.
 const MIN_SCALE_M: f64 = 1e-4;
 
-/// `n` Gaussians at rest, sorted by voxel (x, then y, then z); every array has length `n`.
+/// The two longer standard deviations are at least this part of the voxel's edge: a Gaussian stands for the whole
+/// surface in its voxel, and at half the spacing neighbours close up (two Gaussians their own 2 sigma apart blend to
+/// a flat top).
+const FILL: f64 = 0.45;
+
+/// `n` Gaussians at rest; every array has length `n`.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MapCloud {
     /// What the positions are relative to, in the map frame, metres.
@@ -29,29 +35,33 @@ pub struct MapCloud {
 }
 
 impl MapCloud {
-    pub(super) fn from_cells(origin: DVec3, voxel_m: f64, cells: &[Cell]) -> Self {
+    /// None yet.
+    pub fn empty(origin: DVec3) -> Self {
+        Self { origin, ..Self::default() }
+    }
+
+    /// Adds a tile's cells, sorted by voxel. `corner` is the tile's, relative to the cloud's origin; `fill`: whether
+    /// the Gaussians are made to fill their voxels.
+    pub(super) fn push_cells(&mut self, corner: DVec3, voxel_m: f64, cells: &[Cell], fill: bool) {
         let mut sorted: Vec<&Cell> = cells.iter().collect();
-        sorted.par_sort_unstable_by_key(|c| c.key);
+        sorted.sort_unstable_by_key(|c| c.key);
         let shapes: Vec<_> = sorted
             .par_iter()
+            .with_min_len(512)
             .map(|c| {
                 let (q, s) = rotation_and_scales(&c.cov.map(f64::from), MIN_SCALE_M);
+                let least = if fill { FILL * voxel_m * f64::from(1u32 << level_of(c.key)) } else { 0.0 };
                 let q = q.as_quat();
-                ([q.w, q.x, q.y, q.z], s.as_vec3().to_array())
+                ([q.w, q.x, q.y, q.z], s.max(DVec3::new(least, least, 0.0)).as_vec3().to_array())
             })
             .collect();
-        let position = |c: &Cell| {
-            let corner = DVec3::from(c.key.map(f64::from));
-            ((corner + 0.5) * voxel_m + c.offset.as_dvec3()).as_vec3().to_array()
-        };
-        Self {
-            origin,
-            positions: sorted.iter().map(|c| position(c)).collect(),
-            colors01: sorted.iter().map(|c| c.color.clamp(glam::Vec3::ZERO, glam::Vec3::ONE).to_array()).collect(),
-            opacities: sorted.iter().map(|c| c.opacity.clamp(0.0, 1.0)).collect(),
-            scales: shapes.iter().map(|(_, s)| *s).collect(),
-            quats: shapes.iter().map(|(q, _)| *q).collect(),
-            confidences: sorted.iter().map(|c| c.weight).collect(),
+        for (c, (quat, scales)) in sorted.iter().zip(shapes) {
+            self.positions.push((corner + c.position.as_dvec3()).as_vec3().to_array());
+            self.colors01.push(c.color.clamp(Vec3::ZERO, Vec3::ONE).to_array());
+            self.opacities.push(c.opacity.clamp(0.0, 1.0));
+            self.scales.push(scales);
+            self.quats.push(quat);
+            self.confidences.push(c.weight);
         }
     }
 

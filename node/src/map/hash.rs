@@ -5,10 +5,10 @@ use std::hash::{BuildHasherDefault, Hasher};
 
 /// Hashes three 32-bit indices with two multiplications.
 #[derive(Debug, Default, Clone, Copy)]
-pub(super) struct VoxelHasher(u64);
+pub struct VoxelHasher(u64);
 
 /// For `HashMap`.
-pub(super) type VoxelHash = BuildHasherDefault<VoxelHasher>;
+pub type VoxelHash = BuildHasherDefault<VoxelHasher>;
 
 /// Odd, with bits spread evenly (the golden ratio's), so that neighbouring indices land far apart.
 const SPREAD: u64 = 0x9e37_79b9_7f4a_7c15;

@@ -1,94 +1,230 @@
-//! The long-horizon map: static Gaussians merged in voxels.
+//! The long-horizon map: what stands still, in tiles.
 //!
-//! One Gaussian per voxel, by confidence-weighted moment matching of all that fell into it. Positions are kept relative
-//! to their voxel and voxels relative to an f64 origin, so the size of map coordinates does not matter.
+//! A tile is a cube with f64 corners in the map frame that holds the Gaussians in it in f32: one per occupied voxel, by
+//! confidence-weighted moment matching of all that was seen there. Voxels are as fine as the nearest look was: what is
+//! seen from close up replaces what was seen from afar. A surface that later rays pass clearly through goes; what
+//! nobody looks at stays as it is. When memory is full, far tiles go to disk and come back with the vehicle.
 
 mod cell;
 mod cloud;
+mod correct;
 mod eigen;
+mod error;
+mod format;
+mod free_space;
+mod fuse;
+mod gather;
 mod hash;
+mod model;
+mod place;
+mod room;
 mod select;
+mod store;
+mod tile;
+mod voxel;
 
 use std::collections::HashMap;
+use std::path::Path;
 
-use glam::{DMat3, DVec3, Quat, Vec3};
+use glam::DVec3;
 use serde::Serialize;
-use storm_render::Gaussians;
 
 use crate::config::MapConfig;
-use crate::rigid::Rigid;
-use cell::{Cell, Sample, covariance};
 pub use cloud::MapCloud;
-use hash::VoxelHash;
+pub use correct::PoseCorrection;
+pub use error::MapError;
+use format::MapIndex;
+pub use free_space::DepthView;
+pub use fuse::MapWindow;
+pub use gather::SceneLook;
+pub(crate) use hash::VoxelHash;
+pub use model::{ObjectModel, ObjectSample};
+pub use place::Eye;
 pub use select::{color01, confidence, static_weight};
-
-/// Part of a full map that goes at once when it is full: few enough to be a small loss, enough that finding them is
-/// paid for by many insertions.
-const EVICTED_PART: usize = 64;
-
-/// Standard deviations beyond this are no surface but a mistake, metres (and their squares stay far inside f32).
-const MAX_SCALE_M: f32 = 1e3;
-
-/// Weights beyond this are a mistake of the caller; sums of them stay finite.
-const MAX_SAMPLE_WEIGHT: f32 = 1e6;
-
-/// Colours beyond this are a mistake; the network's lie near -1 to 1.
-const MAX_COLOR: f32 = 1e3;
-
-/// Voxel indices beyond this are refused: half of what fits, so that neighbours exist.
-const MAX_INDEX: f64 = (1 << 30) as f64;
+use store::Store;
+use tile::Tile;
+pub use tile::TileIndex;
+pub use voxel::MAX_PER_EDGE;
 
 /// What became of the Gaussians.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct MapCounts {
-    /// Merged into a voxel that held something.
+    /// Merged into a surface that was there.
     pub merged: u64,
     /// First of their voxel.
     pub created: u64,
     /// Not selected by the caller.
     pub skipped: u64,
-    /// Refused: a number not finite or out of range.
+    /// Refused: a number not finite or out of range, or a tile that is full.
     pub rejected: u64,
+    /// Coarse voxels given up for finer ones.
+    pub refined: u64,
+    /// Voxels that joined another of the same surface.
+    pub joined: u64,
+    /// Voxels gone because later rays passed through them.
+    pub carved: u64,
     /// Voxels given up because the map was full, the least confident first.
     pub evicted: u64,
+    /// Tiles put to disk to make room.
+    pub spilled: u64,
+    /// Tiles brought back from disk.
+    pub returned: u64,
+    /// Tiles that could not be put to disk; they stayed in memory.
+    pub spill_failed: u64,
+    /// Tiles on disk that could not be read back; their place starts anew.
+    pub tiles_lost: u64,
 }
 
 impl MapCounts {
-    fn add(&mut self, other: &Self) {
-        self.merged += other.merged;
-        self.created += other.created;
-        self.skipped += other.skipped;
-        self.rejected += other.rejected;
-        self.evicted += other.evicted;
+    fn add(&mut self, o: &Self) {
+        for (sum, x) in [
+            (&mut self.merged, o.merged),
+            (&mut self.created, o.created),
+            (&mut self.skipped, o.skipped),
+            (&mut self.rejected, o.rejected),
+            (&mut self.refined, o.refined),
+            (&mut self.joined, o.joined),
+            (&mut self.carved, o.carved),
+            (&mut self.evicted, o.evicted),
+            (&mut self.spilled, o.spilled),
+            (&mut self.returned, o.returned),
+            (&mut self.spill_failed, o.spill_failed),
+            (&mut self.tiles_lost, o.tiles_lost),
+        ] {
+            *sum += x;
+        }
     }
 }
 
-/// The map. Bounded by `map.max_gaussians`; its content depends on what was inserted in which order, and on nothing
-/// else.
+/// What is known about a place of the map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StaticEvidence {
+    /// Sum of the confidences merged there.
+    pub confidence: f32,
+    /// Time between the first and the last look, seconds.
+    pub seen_for_sec: f32,
+}
+
+/// The map. Its content depends on what was fused in which order, and on nothing else: not on threads, and not on
+/// which tiles were on disk meanwhile.
 #[derive(Debug)]
-pub struct VoxelMap {
-    voxel_m: f64,
-    max_cells: usize,
+pub struct StaticMap {
+    config: MapConfig,
     origin: Option<DVec3>,
-    cells: Vec<Cell>,
-    index: HashMap<[i32; 3], u32, VoxelHash>,
+    first_stamp_ns: i64,
+    /// Where the vehicle was last, relative to the origin.
+    here: DVec3,
+    /// Windows fused.
+    revision: u64,
+    tiles: Vec<Tile>,
+    by_index: HashMap<TileIndex, u32, VoxelHash>,
+    /// Per tile, which samples of the window being fused are its own; kept for its memory.
+    jobs: Vec<Vec<(u32, u32)>>,
+    store: Option<Store>,
+    /// Putting tiles to disk is not tried again before this revision.
+    retry_spill_at: u64,
     counts: MapCounts,
 }
 
-impl VoxelMap {
-    /// An empty map; its origin is the first anchor's position.
+impl StaticMap {
+    /// An empty map that lives in memory alone: when it is full, the least confident Gaussians go.
     pub fn new(config: &MapConfig) -> Self {
         Self {
-            voxel_m: config.voxel_m,
-            max_cells: config.max_gaussians.clamp(1, u32::MAX as usize),
+            config: config.clone(),
             origin: None,
-            cells: Vec::new(),
-            index: HashMap::default(),
+            first_stamp_ns: 0,
+            here: DVec3::ZERO,
+            revision: 0,
+            tiles: Vec::new(),
+            by_index: HashMap::default(),
+            jobs: Vec::new(),
+            store: None,
+            retry_spill_at: 0,
             counts: MapCounts::default(),
         }
     }
 
-    /// Places the origin (map frame, metres) before the first insertion; false, and nothing done, after it.
+    /// An empty map that may put tiles into the folder `dir`, and can be saved there. A map that was saved there goes.
+    ///
+    /// # Errors
+    /// A folder that cannot be made or emptied.
+    pub fn in_folder(config: &MapConfig, dir: &Path) -> Result<Self, MapError> {
+        Ok(Self { store: Some(Store::create(dir)?), ..Self::new(config) })
+    }
+
+    /// A map saved in `dir`, ready to grow. Its tiles stay on disk until they are needed.
+    ///
+    /// Second: what could not be read, one error per tile, each naming it; never anything unless `salvage` is set.
+    ///
+    /// # Errors
+    /// No index, a damaged index, other tile or voxel sizes than `config` asks for, and without `salvage` any damaged
+    /// tile.
+    pub fn load(config: &MapConfig, dir: &Path, salvage: bool) -> Result<(Self, Vec<MapError>), MapError> {
+        let (store, index, problems) = Store::open(dir, salvage)?;
+        for (name, saved, wanted) in
+            [("map.tile_m", index.tile_m, config.tile_m), ("map.voxel_m", index.voxel_m, config.voxel_m)]
+        {
+            if saved != wanted {
+                return Err(MapError::OtherSizes { path: dir.to_owned(), name, saved, wanted });
+            }
+        }
+        let mut map = Self::new(config);
+        (map.origin, map.revision) = (Some(index.origin), index.revision);
+        map.first_stamp_ns = index.first_stamp_ns;
+        map.counts.tiles_lost = problems.len() as u64;
+        map.store = Some(store);
+        Ok((map, problems))
+    }
+
+    /// A map saved in `dir`, with the tile and voxel sizes it was made with and otherwise the defaults.
+    ///
+    /// # Errors
+    /// As [`StaticMap::load`].
+    pub fn open(dir: &Path, salvage: bool) -> Result<(Self, Vec<MapError>), MapError> {
+        let (tile_m, voxel_m) = store::sizes(dir)?;
+        Self::load(&MapConfig { tile_m, voxel_m, max_written: 0, ..MapConfig::default() }, dir, salvage)
+    }
+
+    /// A copy of the map saved in `from`, kept in `dir` from now on; `from` is not changed.
+    ///
+    /// # Errors
+    /// As [`StaticMap::load`], and what cannot be copied.
+    pub fn copied(config: &MapConfig, from: &Path, dir: &Path) -> Result<Self, MapError> {
+        // The index last, as ever.
+        drop(Store::create(dir)?);
+        store::copy(from, dir)?;
+        Ok(Self::load(config, dir, false)?.0)
+    }
+
+    /// Writes what has changed since the last save, then an index of everything: a process that dies at any moment
+    /// leaves the last complete save.
+    ///
+    /// # Errors
+    /// A map without a folder, or a file that cannot be written; the last save stays whole.
+    pub fn save(&mut self) -> Result<(), MapError> {
+        let index = MapIndex {
+            tile_m: self.config.tile_m,
+            voxel_m: self.config.voxel_m,
+            origin: self.origin(),
+            revision: self.revision,
+            first_stamp_ns: self.first_stamp_ns,
+            entries: Vec::new(),
+        };
+        let Some(store) = &mut self.store else {
+            return Err(MapError::Damaged { path: "map".into(), reason: "this map was made without a folder".into() });
+        };
+        for tile in &mut self.tiles {
+            tile.sweep();
+            if tile.cells.is_empty() {
+                store.discard(&tile.index);
+            } else {
+                store.put(tile)?;
+            }
+        }
+        store.commit(index)
+    }
+
+    /// Places the origin (map frame, metres) before the first window; false, and nothing done, after it.
     pub fn set_origin(&mut self, origin: DVec3) -> bool {
         let free = self.origin.is_none() && origin.is_finite();
         if free {
@@ -97,152 +233,141 @@ impl VoxelMap {
         free
     }
 
-    /// What positions of [`VoxelMap::cloud`] are relative to, in the map frame, metres; zero before the first
-    /// insertion.
+    /// What positions of [`StaticMap::cloud`] are relative to, in the map frame, metres; zero before the first window.
     pub fn origin(&self) -> DVec3 {
         self.origin.unwrap_or(DVec3::ZERO)
     }
 
-    /// Merges Gaussians of one window, given in its anchor frame.
-    ///
-    /// `select(i)` gives Gaussian `i`'s confidence, or none to leave it out (see [`static_weight`]); `color(i)` its
-    /// colour, 0 to 1, already corrected for its camera's exposure (see [`color01`]). What is not finite is left out
-    /// and counted.
-    pub fn insert(
-        &mut self,
-        map_from_anchor: &Rigid,
-        gaussians: &Gaussians,
-        select: impl Fn(usize) -> Option<f32>,
-        color: impl Fn(usize) -> [f32; 3],
-    ) -> MapCounts {
-        let mut counts = MapCounts::default();
-        let n = gaussians.len();
-        let whole = gaussians.quats.len() == n && gaussians.scales.len() == n && gaussians.opacities.len() == n;
-        if !(whole && map_from_anchor.is_finite()) {
-            counts.rejected = n as u64;
-            self.counts.add(&counts);
-            return counts;
-        }
-        let origin = *self.origin.get_or_insert(map_from_anchor.translation);
-        let placed = Placed {
-            origin_from_anchor: Rigid::new(map_from_anchor.rotation, map_from_anchor.translation - origin)
-                .snapped()
-                .translation,
-            turn: map_from_anchor.matrix3(),
-            rotation: map_from_anchor.rotation.as_quat(),
-            voxel_m: self.voxel_m,
-        };
-        for i in 0..n {
-            let Some(weight) = select(i) else {
-                counts.skipped += 1;
-                continue;
-            };
-            let Some((key, sample)) = placed.sample(gaussians, i, weight, color(i)) else {
-                counts.rejected += 1;
-                continue;
-            };
-            if let Some(&at) = self.index.get(&key) {
-                self.cells[at as usize].merge(&sample);
-                counts.merged += 1;
-            } else {
-                if self.cells.len() >= self.max_cells {
-                    counts.evicted += self.evict();
-                }
-                self.index.insert(key, self.cells.len() as u32);
-                self.cells.push(Cell::new(key, &sample));
-                counts.created += 1;
-            }
-        }
-        self.counts.add(&counts);
-        counts
+    /// Folder of the map's files, if it has one.
+    pub fn folder(&self) -> Option<&Path> {
+        self.store.as_ref().map(Store::dir)
     }
 
-    /// Gaussians in the map, one per occupied voxel.
+    /// Gaussians in the map, those on disk included.
     pub fn len(&self) -> usize {
-        self.cells.len()
+        self.loaded() + self.away().map(|(_, _, cells)| cells as usize).sum::<usize>()
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &MapConfig {
+        &self.config
+    }
+
+    /// Tiles, those on disk included.
+    pub fn tile_count(&self) -> usize {
+        self.tiles.len() + self.away().count()
+    }
+
+    /// Gaussians in memory.
+    pub fn loaded(&self) -> usize {
+        self.tiles.iter().map(Tile::len).sum()
     }
 
     /// True when there are none.
     pub fn is_empty(&self) -> bool {
-        self.cells.is_empty()
+        self.len() == 0
     }
 
     /// Memory held, bytes.
     pub fn bytes(&self) -> usize {
-        // A hash table entry is its key and value, one control byte, and the eighth that stays free.
-        let entry = (size_of::<([i32; 3], u32)>() + 1) * 8 / 7;
-        self.cells.capacity() * size_of::<Cell>() + self.index.capacity() * entry
+        self.tiles.iter().map(Tile::bytes).sum()
     }
 
-    /// What became of everything inserted so far.
+    /// Space taken on disk by the newest version of every saved tile, bytes.
+    pub fn disk_bytes(&self) -> u64 {
+        self.store.as_ref().map_or(0, Store::bytes)
+    }
+
+    /// What became of everything so far.
     pub fn counts(&self) -> MapCounts {
         self.counts
     }
 
-    /// The map as plain arrays, sorted by voxel.
-    pub fn cloud(&self) -> MapCloud {
-        MapCloud::from_cells(self.origin(), self.voxel_m, &self.cells)
+    /// Number of windows fused; what changes from now on has a greater one.
+    pub fn revision(&self) -> u64 {
+        self.revision
     }
 
-    /// Gives up the least confident cells; of equals, the ones first in the list. Returns how many.
-    fn evict(&mut self) -> u64 {
-        let n = (self.cells.len() / EVICTED_PART).max(1);
-        // Positive floats order as their bits do, so weight and place fit in one number that is quick to compare.
-        let rank = |(i, c): (usize, &Cell)| u64::from(c.weight.to_bits()) << 32 | i as u64;
-        let mut order: Vec<u64> = self.cells.iter().enumerate().map(rank).collect();
-        order.select_nth_unstable(n - 1);
-        order.truncate(n);
-        let mut places: Vec<u32> = order.into_iter().map(|r| r as u32).collect();
-        // From the back, so that what moves into a hole is never itself about to go.
-        places.sort_unstable_by(|a, b| b.cmp(a));
-        for at in places {
-            let gone = self.cells.swap_remove(at as usize);
-            self.index.remove(&gone.key);
-            if let Some(moved) = self.cells.get(at as usize) {
-                self.index.insert(moved.key, at);
-            }
-        }
-        n as u64
+    /// What the map knows of a place (map frame, metres); none where it has nothing, or nothing in memory.
+    pub fn evidence(&self, position_map: DVec3) -> Option<StaticEvidence> {
+        let place = (position_map - self.origin?) / self.config.tile_m;
+        let index = place.floor();
+        let tile = self.by_index.get(&index.to_array().map(|x| x as i32))?;
+        let local = ((place - index) * self.config.tile_m).as_vec3();
+        let cell = self.tiles.get(*tile as usize)?.around(local)?;
+        let seen_for_sec = cell.seen_ms.saturating_sub(cell.born_ms) as f32 * 1e-3;
+        Some(StaticEvidence { confidence: cell.weight, seen_for_sec })
     }
-}
 
-/// One window's place in the map.
-struct Placed {
-    origin_from_anchor: DVec3,
-    /// The same rotation twice: for positions in f64, for shapes in f32.
-    turn: DMat3,
-    rotation: Quat,
-    voxel_m: f64,
-}
+    /// Tiles that changed after `revision`, by index; all of them for 0. An empty cloud means that nothing is left in
+    /// the tile. Tiles on disk are included as they were saved.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn changed_since(&self, revision: u64) -> Result<Vec<(TileIndex, MapCloud)>, MapError> {
+        let here = self.tiles.iter().map(|t| (t.index, t.revision));
+        let away = self.away().map(|(index, revision, _)| (index, revision));
+        let mut changed: Vec<TileIndex> = here.chain(away).filter(|(_, r)| *r > revision).map(|(i, _)| i).collect();
+        changed.sort_unstable();
+        changed.into_iter().map(|index| Ok((index, self.tile_cloud(&index)?))).collect()
+    }
 
-impl Placed {
-    /// Gaussian `i`'s voxel and moments; none when a number is not finite or out of range.
-    fn sample(&self, g: &Gaussians, i: usize, weight: f32, color: [f32; 3]) -> Option<([i32; 3], Sample)> {
-        let (mean, scale, color) = (Vec3::from(g.means[i]), Vec3::from(g.scales[i]), Vec3::from(color));
-        let [w, x, y, z] = g.quats[i];
-        let q = Quat::from_xyzw(x, y, z, w);
-        let (opacity, norm) = (g.opacities[i], q.length());
-        let plausible = mean.is_finite()
-            && scale.min_element() >= 0.0
-            && scale.max_element() <= MAX_SCALE_M
-            && norm > 1e-6
-            && norm < 1e6
-            && (0.0..=1.0).contains(&opacity)
-            && color.abs().max_element() <= MAX_COLOR
-            && weight > 0.0
-            && weight <= MAX_SAMPLE_WEIGHT;
-        if !(plausible && scale.is_finite() && color.is_finite() && q.is_finite()) {
-            return None;
+    /// The whole map as plain arrays, sorted by tile and voxel. When it has more than `map.max_written` Gaussians,
+    /// every second, every third, ... is left out, evenly over each tile.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn cloud(&self) -> Result<MapCloud, MapError> {
+        let every = match self.config.max_written {
+            0 => 1,
+            most => self.len().div_ceil(most).max(1),
+        };
+        let mut cloud = MapCloud::empty(self.origin());
+        self.each_tile(|corner, tile| {
+            let live: Vec<_> = tile.live().step_by(every).copied().collect();
+            cloud.push_cells(corner, self.config.voxel_m, &live, true);
+        })?;
+        Ok(cloud)
+    }
+
+    /// One tile as plain arrays.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn tile_cloud(&self, index: &TileIndex) -> Result<MapCloud, MapError> {
+        let mut cloud = MapCloud::empty(self.origin());
+        self.with_tile(index, |corner, tile| {
+            let live: Vec<_> = tile.live().copied().collect();
+            cloud.push_cells(corner, self.config.voxel_m, &live, true);
+        })?;
+        Ok(cloud)
+    }
+
+    /// Calls for every tile that holds something, by index; its corner is relative to the origin.
+    fn each_tile(&self, mut visit: impl FnMut(DVec3, &Tile)) -> Result<(), MapError> {
+        let mut all: Vec<TileIndex> = self.tiles.iter().map(|t| t.index).chain(self.away().map(|a| a.0)).collect();
+        all.sort_unstable();
+        all.iter().try_for_each(|index| self.with_tile(index, &mut visit))
+    }
+
+    fn with_tile(&self, index: &TileIndex, visit: impl FnOnce(DVec3, &Tile)) -> Result<(), MapError> {
+        let corner = self.corner(index);
+        if let Some(tile) = self.by_index.get(index).and_then(|&i| self.tiles.get(i as usize)) {
+            visit(corner, tile);
+        } else if let Some(tile) = self.store.as_ref().and_then(|s| s.get(index, self.config.voxel_m)) {
+            visit(corner, &tile?);
         }
-        let position = self.origin_from_anchor + self.turn * mean.as_dvec3();
-        let index = (position / self.voxel_m).floor();
-        if index.abs().max_element() <= MAX_INDEX {
-            let offset = (position - (index + 0.5) * self.voxel_m).as_vec3();
-            let cov = covariance(self.rotation * (q * (1.0 / norm)), scale);
-            let key = [index.x as i32, index.y as i32, index.z as i32];
-            return Some((key, Sample { offset, cov, color, opacity, weight }));
-        }
-        None
+        Ok(())
+    }
+
+    /// A tile's corner relative to the origin, metres.
+    fn corner(&self, index: &TileIndex) -> DVec3 {
+        DVec3::from(index.map(f64::from)) * self.config.tile_m
+    }
+
+    /// Tiles that are on disk and not in memory, in no order.
+    fn away(&self) -> impl Iterator<Item = (TileIndex, u64, u32)> + '_ {
+        self.store.iter().flat_map(Store::tiles).filter(|(index, ..)| !self.by_index.contains_key(index))
     }
 }
 

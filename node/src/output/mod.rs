@@ -5,6 +5,7 @@ pub mod bag_metadata;
 pub mod bag_writer;
 pub mod cloud;
 pub mod error;
+pub mod objects_csv;
 pub mod picture;
 pub mod ply;
 pub mod qos;

@@ -1,10 +1,10 @@
 //! Trajectories of moving points as CSV, one observation a row.
 
-use std::io::Write;
-use std::path::Path;
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
 
 use super::OutputError;
-use super::atomic::write_atomic;
 
 /// The header line.
 pub const TRACKS_HEADER: &str = "track_id,stamp_ns,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,motion_id";
@@ -24,23 +24,53 @@ pub struct TrackRow {
     pub motion_id: u16,
 }
 
-/// Writes rows in the order given. Errors on a number that is not finite.
-pub fn write_tracks_csv<'a>(path: &Path, rows: impl IntoIterator<Item = &'a TrackRow>) -> Result<(), OutputError> {
-    write_atomic(path, |out| {
-        writeln!(out, "{TRACKS_HEADER}").map_err(OutputError::io(path))?;
-        for (index, row) in rows.into_iter().enumerate() {
+/// Writes rows as they come. Until it is finished the file has a temporary name beside its place, complete up to the
+/// last flushed row: what a killed run leaves.
+#[derive(Debug)]
+pub struct TracksWriter {
+    out: BufWriter<File>,
+    part: PathBuf,
+    path: PathBuf,
+    rows: usize,
+}
+
+impl TracksWriter {
+    /// Starts `path` (under its temporary name) with the header line.
+    pub fn create(path: &Path) -> Result<Self, OutputError> {
+        let part = path.with_extension("csv.part");
+        let mut out = BufWriter::new(File::create(&part).map_err(OutputError::io(&part))?);
+        writeln!(out, "{TRACKS_HEADER}").map_err(OutputError::io(&part))?;
+        Ok(Self { out, part, path: path.to_owned(), rows: 0 })
+    }
+
+    /// Adds rows. Errors on a number that is not finite; rows before it are written.
+    pub fn write<'a>(&mut self, rows: impl IntoIterator<Item = &'a TrackRow>) -> Result<(), OutputError> {
+        for row in rows {
             let [x, y, z] = row.position_m;
             let [vx, vy, vz] = row.velocity_mps;
             let all = [x, y, z, f64::from(vx), f64::from(vy), f64::from(vz)];
             if let Some(value) = all.into_iter().find(|v| !v.is_finite()) {
-                return Err(OutputError::NonFinite { what: format!("row of track {}", row.track_id), index, value });
+                let what = format!("row of track {}", row.track_id);
+                return Err(OutputError::NonFinite { what, index: self.rows, value });
             }
             // `{}` prints the shortest text that reads back as the same number.
-            writeln!(out, "{},{},{x},{y},{z},{vx},{vy},{vz},{}", row.track_id, row.stamp_ns, row.motion_id)
-                .map_err(OutputError::io(path))?;
+            writeln!(self.out, "{},{},{x},{y},{z},{vx},{vy},{vz},{}", row.track_id, row.stamp_ns, row.motion_id)
+                .map_err(OutputError::io(&self.part))?;
+            self.rows += 1;
         }
         Ok(())
-    })
+    }
+
+    /// Hands everything to the system: a killed process loses none of it.
+    pub fn flush(&mut self) -> Result<(), OutputError> {
+        self.out.flush().map_err(OutputError::io(&self.part))
+    }
+
+    /// Gives the file its name.
+    pub fn finish(mut self) -> Result<(), OutputError> {
+        self.flush()?;
+        std::fs::rename(&self.part, &self.path).map_err(OutputError::io(&self.path))
+    }
 }
 
 #[cfg(test)]
@@ -58,8 +88,17 @@ mod tests {
             velocity_mps: [1.1, -2.5, 0.0],
             motion_id: 3,
         };
-        write_tracks_csv(&path, [&row]).unwrap();
+        let mut writer = TracksWriter::create(&path).unwrap();
+        writer.write([&row]).unwrap();
+        writer.flush().unwrap();
+        assert!(!path.exists(), "not before it is finished");
+        let killed = std::fs::read_to_string(dir.path().join("tracks.csv.part")).unwrap();
+        writer.write([&row]).unwrap();
+        let bad = TrackRow { velocity_mps: [f32::INFINITY, 0.0, 0.0], ..row };
+        assert!(matches!(writer.write([&row, &bad]), Err(OutputError::NonFinite { index: 3, .. })));
+        writer.finish().unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
+        assert!(killed.lines().count() == 2 && text.starts_with(&killed) && text.lines().count() == 4);
         let mut lines = text.lines();
         assert_eq!(lines.next(), Some(TRACKS_HEADER));
         let cells: Vec<&str> = lines.next().unwrap().split(',').collect();
@@ -69,8 +108,5 @@ mod tests {
             assert_eq!(cells[2 + k].parse(), Ok(row.position_m[k]));
             assert_eq!(cells[5 + k].parse(), Ok(row.velocity_mps[k]));
         }
-        let bad = TrackRow { velocity_mps: [f32::INFINITY, 0.0, 0.0], ..row };
-        assert!(matches!(write_tracks_csv(&path, [&row, &bad]), Err(OutputError::NonFinite { index: 1, .. })));
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), text, "a refused file replaces nothing");
     }
 }

@@ -5,7 +5,10 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use crate::engine::score::Scores;
+use crate::map::MapCounts;
+use crate::objects::ObjectCounts;
 use crate::sync::DropReason;
+use crate::tracks::TrackCounts;
 
 use super::front::Front;
 use super::step::Finished;
@@ -88,10 +91,20 @@ pub struct Metrics {
     pub gaussians_left_out: u64,
     /// Gaussians in the map.
     pub map_gaussians: u64,
+    /// What became of the Gaussians offered to the map.
+    pub map: MapCounts,
+    /// Memory of the map, MiB.
+    pub map_mb: f64,
+    /// Times the map could not be saved.
+    pub map_saves_failed: u64,
     /// Map Gaussians given up to the hard cap.
     pub map_evicted: u64,
     /// Trajectories written.
     pub tracks: u64,
+    /// What became of points and trajectories.
+    pub track_counts: TrackCounts,
+    /// What became of moving objects.
+    pub objects: ObjectCounts,
     /// What `map.ply` is relative to, map frame, metres.
     pub origin_m: [f64; 3],
     /// Times the clock jumped or the recording looped.
@@ -112,6 +125,9 @@ impl Metrics {
             + self.non_finite_windows
             + self.withheld
             + self.map_evicted
+            + self.map_saves_failed
+            + self.map.spill_failed
+            + self.map.tiles_lost
             > 0
             || !self.problems.is_empty()
     }
@@ -127,6 +143,9 @@ impl Metrics {
             (self.non_finite_windows, "windows not finite"),
             (self.withheld, "points withheld"),
             (self.map_evicted, "map Gaussians evicted"),
+            (self.map_saves_failed, "saves of the map failed"),
+            (self.map.spill_failed, "map tiles not put to disk"),
+            (self.map.tiles_lost, "map tiles lost"),
         ] {
             if n > 0 {
                 parts.push(format!("{n} {what}"));

@@ -30,6 +30,9 @@ const EVENTS_AHEAD: usize = 64;
 /// Steps that may wait to be written.
 const STEPS_AHEAD: usize = 4;
 
+/// Folder of the map's own files in the results folder.
+pub const MAP_FOLDER: &str = "map";
+
 /// What to replay, and where the results go.
 pub struct ReplayOptions {
     /// The bag.
@@ -114,7 +117,7 @@ fn run_stages(
         let stop = &options.stop;
         let reader = scope.spawn(move || read(source, &to_step, total, stop, progress));
         let writer = scope.spawn(move || write(sink, &inputs));
-        let stepped = step_all(source, &rig, engine, &options.config, &events, &to_sink);
+        let stepped = step_all(source, &rig, engine, options, &events, &to_sink);
         // Closing the channels ends the other stages, also when this one failed.
         drop(events);
         drop(to_sink);
@@ -144,10 +147,11 @@ fn step_all(
     source: &BagSource,
     rig: &Arc<Rig>,
     engine: Engine,
-    config: &Config,
+    options: &ReplayOptions,
     events: &Receiver<Event>,
     to_sink: &Sender<SinkInput>,
 ) -> Result<(Front, Finished)> {
+    let config = &options.config;
     let store = match source.plan().pose {
         PoseTopic::Message(_) => PoseStore::Buffer(PoseBuffer::new(&config.sync)),
         PoseTopic::Tf => PoseStore::Tree {
@@ -157,17 +161,45 @@ fn step_all(
         },
     };
     let mut front = Front::new(config, rig, store);
-    let mut maker = StepMaker::new(engine, rig.intrinsics(), config);
+    let mut maker = StepMaker::new(engine, rig.intrinsics(), config, Some(&options.out.join(MAP_FOLDER)))?;
+    let mut saver = Saver { every_sec: config.map.save_every_sec, last: Instant::now(), failed: 0 };
     let mut ready = VecDeque::new();
     for event in events {
         front.take(event, &mut ready);
         if !hand_on(&mut ready, &front, &mut maker, to_sink)? {
             break;
         }
+        saver.offer(&mut maker);
     }
     front.finish(&mut ready);
     hand_on(&mut ready, &front, &mut maker, to_sink)?;
-    Ok((front, maker.finish()))
+    saver.save(&mut maker);
+    Ok((front, Finished { map_saves_failed: saver.failed, ..maker.finish() }))
+}
+
+/// Saves the map every so often of wall time: what a killed run loses is time somebody waited. When it happens changes
+/// nothing in the map.
+struct Saver {
+    every_sec: f64,
+    last: Instant,
+    failed: u64,
+}
+
+impl Saver {
+    fn offer(&mut self, maker: &mut StepMaker) {
+        if self.every_sec > 0.0 && self.last.elapsed().as_secs_f64() >= self.every_sec {
+            self.save(maker);
+        }
+    }
+
+    /// A save that fails is said and counted; the run goes on.
+    fn save(&mut self, maker: &mut StepMaker) {
+        if let Err(e) = maker.save_map() {
+            self.failed += 1;
+            warn!("the map could not be saved: {e}");
+        }
+        self.last = Instant::now();
+    }
 }
 
 /// Runs windows, passes the rest through; false when the writer has gone.
@@ -184,10 +216,21 @@ fn hand_on(
                 SinkInput::Set { set, vehicle }
             }
             FrontOutput::Truth { camera, stamp_ns, kind, image } => SinkInput::Truth { camera, stamp_ns, kind, image },
-            FrontOutput::Window(window) => match maker.run(window)? {
-                Some(step) => SinkInput::Step(Arc::new(step)),
-                None => continue,
-            },
+            FrontOutput::Window(window) => {
+                let step = maker.run(window)?;
+                let ended = maker.ended_tracks();
+                if !ended.is_empty() && to_sink.send(SinkInput::Tracks(ended)).is_err() {
+                    return Ok(false);
+                }
+                let ended = maker.ended_objects();
+                if !ended.is_empty() && to_sink.send(SinkInput::Objects(ended)).is_err() {
+                    return Ok(false);
+                }
+                match step {
+                    Some(step) => SinkInput::Step(Arc::new(step)),
+                    None => continue,
+                }
+            }
         };
         if to_sink.send(input).is_err() {
             return Ok(false);

@@ -1,22 +1,29 @@
 //! One step: a window through the network, its pictures, and what it adds to the map and the trajectories.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
 use storm_model::ModelError;
-use storm_model::scene::{Affine, RenderedView, Scene, Want};
+use storm_model::scene::{RenderedView, Scene, Want};
 use storm_render::Intrinsics;
 use tracing::warn;
 
-use crate::config::{Config, MapConfig};
+use crate::config::Config;
 use crate::engine::{Engine, select, views_of};
-use crate::map::{VoxelMap, color01, static_weight};
+use crate::map::{MapError, SceneLook, StaticMap};
+use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
+use crate::rigid::Rigid;
 use crate::source::Frame;
-use crate::tracks::{Track, Tracker};
+use crate::tracks::{Track, TrackCounts, Tracker};
 use crate::window::Window;
 
 use super::timing::Timings;
+
+/// A surface the map has seen at one place for this long stands, whatever a network under fast ego motion says of its
+/// speed: nothing that moves at a gate of 1 m/s stays in a voxel that long.
+const STANDS_SEC: f64 = 1.0;
 
 /// What one step gives.
 pub struct Step {
@@ -37,26 +44,43 @@ pub struct StepMaker {
     engine: Engine,
     cameras: Vec<Intrinsics>,
     config: Config,
-    map: VoxelMap,
+    map: StaticMap,
     tracker: Tracker,
+    objects: ObjectTracker,
     timings: Timings,
     steps: u64,
     non_finite: u64,
 }
 
 impl StepMaker {
-    /// For one run.
-    pub fn new(engine: Engine, cameras: Vec<Intrinsics>, config: &Config) -> Self {
-        Self {
+    /// For one run. The map's tiles and saves go to `map_dir`; none: it lives in memory alone.
+    ///
+    /// # Errors
+    /// A folder that cannot be made, or a map to go on from that cannot be read.
+    pub fn new(
+        engine: Engine,
+        cameras: Vec<Intrinsics>,
+        config: &Config,
+        map_dir: Option<&Path>,
+    ) -> Result<Self, MapError> {
+        let map = match map_dir {
+            Some(dir) if !config.map.load.is_empty() => {
+                StaticMap::copied(&config.map, Path::new(&config.map.load), dir)?
+            }
+            Some(dir) => StaticMap::in_folder(&config.map, dir)?,
+            None => StaticMap::new(&config.map),
+        };
+        Ok(Self {
             engine,
             cameras,
-            map: VoxelMap::new(&config.map),
+            map,
             tracker: Tracker::new(&config.tracks),
+            objects: ObjectTracker::new(&config.objects),
             config: config.clone(),
             timings: Timings::default(),
             steps: 0,
             non_finite: 0,
-        }
+        })
     }
 
     /// Runs one window. `None` when the network's result was not finite: the window is dropped, counted and said.
@@ -80,9 +104,25 @@ impl StepMaker {
             let want = Want { flow: true, motion: true };
             self.timings.time("render", || self.engine.render(&scene, &targets, time_sec, want))?
         };
-        self.timings.time("map", || add_to_map(&mut self.map, &scene, &window, &self.config.map));
-        let points = select::moving_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
+        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
+        let look = SceneLook {
+            stamp_ns: window.stamp_ns,
+            map_from_anchor: &window.map_from_anchor,
+            scene: &scene,
+            cameras: &self.cameras,
+            poses: &poses,
+            rendered: &views,
+            first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
+        };
+        self.timings.time("map", || self.map.fuse_scene(&look));
+        let mut points = select::moving_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
+        for p in &mut points {
+            let known = self.map.evidence(p.position_map);
+            p.may_start = known.is_none_or(|k| f64::from(k.seen_for_sec) < STANDS_SEC);
+        }
         self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
+        let (_, parts) = select::object_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
+        self.timings.time("objects", || self.objects.step(window.stamp_ns, window.epoch, &parts));
         let total_ms = start.elapsed().as_secs_f64() * 1e3;
         self.timings.add("step", total_ms);
         let index = self.steps;
@@ -90,15 +130,41 @@ impl StepMaker {
         Ok(Some(Step { index, window, scene: Arc::new(scene), views, total_ms }))
     }
 
+    /// Moving objects that have ended since the last call.
+    pub fn ended_objects(&mut self) -> Vec<MovingObject> {
+        self.objects.drain()
+    }
+
+    /// Trajectories that have ended since the last call.
+    pub fn ended_tracks(&mut self) -> Vec<Track> {
+        self.tracker.drain()
+    }
+
+    /// Saves the map where its folder is; nothing to do for a map in memory.
+    ///
+    /// # Errors
+    /// A file that cannot be written; the last save stays whole.
+    pub fn save_map(&mut self) -> Result<(), MapError> {
+        match self.map.folder() {
+            Some(_) => self.timings.time("map save", || self.map.save()),
+            None => Ok(()),
+        }
+    }
+
     /// What is left at the end: the map, all trajectories, the stage times, and windows dropped as not finite.
     pub fn finish(mut self) -> Finished {
         let tracks = self.tracker.finish();
+        let objects = self.objects.finish();
         Finished {
             map: self.map,
             tracks,
+            track_counts: self.tracker.counts(),
+            objects,
+            object_counts: self.objects.counts(),
             timings: self.timings,
             steps: self.steps,
             non_finite_windows: self.non_finite,
+            map_saves_failed: 0,
         }
     }
 }
@@ -106,36 +172,27 @@ impl StepMaker {
 /// What a run leaves in memory.
 pub struct Finished {
     /// The map.
-    pub map: VoxelMap,
-    /// Every trajectory.
+    pub map: StaticMap,
+    /// Trajectories that ended last.
     pub tracks: Vec<Track>,
+    /// What became of points and trajectories.
+    pub track_counts: TrackCounts,
+    /// Moving objects that ended last.
+    pub objects: Vec<MovingObject>,
+    /// What became of groups and objects.
+    pub object_counts: ObjectCounts,
     /// Stage times.
     pub timings: Timings,
     /// Steps run.
     pub steps: u64,
     /// Windows whose result was not finite and was thrown away.
     pub non_finite_windows: u64,
+    /// Times the map could not be saved.
+    pub map_saves_failed: u64,
 }
 
 /// Time of the newest timestep's reference camera in the window's clock.
 pub fn newest_time_sec(window: &Window<Frame>) -> f32 {
     let first = window.steps.first().map_or(window.stamp_ns, |s| s.stamp_ns);
     (window.stamp_ns.saturating_sub(first) as f64 * 1e-9) as f32
-}
-
-/// Merges what stands still into the map, once per image: only timesteps that were in no earlier window.
-fn add_to_map(map: &mut VoxelMap, scene: &Scene, window: &Window<Frame>, config: &MapConfig) {
-    let first_new = window.steps.len() - window.new_steps.min(window.steps.len());
-    let picked = select::from_step(scene, first_new);
-    let exposure = Affine::mean(&scene.affine);
-    map.insert(
-        &window.map_from_anchor,
-        &scene.gaussians,
-        |i| {
-            let opacity = scene.gaussians.opacities[i];
-            let weight = || static_weight(config, opacity, select::speed_mps(scene, i), scene.depths[i]);
-            if picked.contains(&i) { weight() } else { None }
-        },
-        |i| color01(&exposure.apply(scene.gaussians.colors[i])),
-    );
 }

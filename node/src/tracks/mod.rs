@@ -2,12 +2,14 @@
 //!
 //! Each live trajectory's end is moved by its own flow to the time of the new step; each new moving Gaussian is
 //! connected to the nearest such place, and so on from step to step. Beyond the paper: the connection has a distance
-//! gate and is one-to-one (mutually nearest); a trajectory may miss its Gaussian for a short while and coasts on its
-//! flow meanwhile; new ones start at moving Gaussians that none passes by, spaced so that one patch of surface does not
-//! start many.
+//! gate that grows with the trajectory's own uncertainty, is one-to-one (mutually nearest) and wants the colours to
+//! agree; a trajectory may miss its Gaussian for a short while and coasts on its flow meanwhile; new ones start at
+//! moving Gaussians that none passes by, spaced so that one patch of surface does not start many. Only the newest
+//! timestep of a window is taken, so a point that several windows see is one point.
 
 mod nearest;
 mod spacing;
+mod track;
 
 use glam::DVec3;
 use serde::Serialize;
@@ -16,48 +18,10 @@ use crate::config::TracksConfig;
 use crate::sync::clock::seconds_between;
 use nearest::mutual_nearest;
 use spacing::Spacing;
-
-/// A trajectory ends after this many points, so that memory stays bounded behind a lead vehicle that never leaves: a
-/// quarter of an hour at 10 Hz.
-const MAX_POINTS: usize = 10_000;
+pub use track::{Track, TrackPoint, TrackSample};
 
 /// Speeds beyond this are a mistake of the network, m/s; the Gaussian is left out and counted.
 const MAX_SPEED_MPS: f64 = 200.0;
-
-/// A moving Gaussian of the newest timestep.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TrackPoint {
-    /// Centre in the map frame, metres.
-    pub position_map: DVec3,
-    /// Velocity in the map frame's axes, m/s.
-    pub velocity_map_mps: DVec3,
-    /// Opacity, 0 to 1.
-    pub opacity: f32,
-    /// Motion token with the largest weight.
-    pub motion_id: u16,
-}
-
-/// One point of a trajectory.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TrackSample {
-    /// The step's stamp, nanoseconds.
-    pub stamp_ns: i64,
-    /// Place in the map frame, metres.
-    pub position_map: DVec3,
-    /// Velocity in the map frame's axes, m/s.
-    pub velocity_map_mps: DVec3,
-    /// Motion token of the Gaussian it is at.
-    pub motion_id: u16,
-}
-
-/// One trajectory.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Track {
-    /// Unique within a run, in order of birth.
-    pub id: u32,
-    /// Oldest first, stamps strictly rising; steps it was not seen at are left out.
-    pub points: Vec<TrackSample>,
-}
 
 /// What became of points and trajectories.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
@@ -70,6 +34,8 @@ pub struct TrackCounts {
     pub too_short: u64,
     /// Points that continued a trajectory.
     pub continued: u64,
+    /// Points near enough to continue a trajectory, but of another colour.
+    pub unlike: u64,
     /// Points that could have started a trajectory but for `max_active`.
     pub no_room: u64,
     /// Points refused: not finite, or absurdly fast.
@@ -112,25 +78,30 @@ impl Tracker {
         let usable: Vec<TrackPoint> = points.iter().copied().filter(plausible).collect();
         self.counts.rejected += (points.len() - usable.len()) as u64;
 
-        let predicted: Vec<DVec3> =
-            self.live.iter().filter_map(|t| t.points.last()).map(|p| moved(p, stamp_ns)).collect();
+        let predicted: Vec<DVec3> = self.live.iter().filter_map(|t| t.predicted(stamp_ns)).collect();
+        let gates_m: Vec<f64> = self.live.iter().map(|t| t.gate_m(stamp_ns, &self.config)).collect();
         let observed: Vec<DVec3> = usable.iter().map(|p| p.position_map).collect();
-        let continued = mutual_nearest(&predicted, &observed, self.config.gate_m);
+        let continued = mutual_nearest(&predicted, &gates_m, &observed, self.config.gate_m);
         for (point, track) in usable.iter().zip(&continued) {
             if let Some(track) = track.and_then(|i| self.live.get_mut(i)) {
-                track.points.push(sample(stamp_ns, point));
-                self.counts.continued += 1;
+                if track.looks_like(point, &self.config) {
+                    track.go_on(stamp_ns, point);
+                    self.counts.continued += 1;
+                } else {
+                    self.counts.unlike += 1;
+                }
             }
         }
         let bridge_sec = self.config.bridge_sec;
-        self.end_where(|t| {
-            let unseen_sec = t.points.last().map_or(0.0, |p| seconds_between(p.stamp_ns, stamp_ns));
-            unseen_sec > bridge_sec || t.points.len() >= MAX_POINTS
-        });
+        self.end_where(|t| t.points.last().map_or(0.0, |p| seconds_between(p.stamp_ns, stamp_ns)) > bridge_sec);
+        if self.config.min_points <= track::PIECE_POINTS {
+            self.finished.extend(self.live.iter_mut().filter_map(Track::cut));
+        }
         self.start(stamp_ns, &usable, &continued);
     }
 
-    /// Trajectories that have ended since the last call and are long enough, in order of id.
+    /// Trajectories that have ended since the last call and are long enough, and pieces of very long ones, in order of
+    /// id.
     pub fn drain(&mut self) -> Vec<Track> {
         self.finished.sort_by_key(|t| t.id);
         std::mem::take(&mut self.finished)
@@ -155,23 +126,25 @@ impl Tracker {
     /// Starts trajectories at the points that continue none, the most opaque first.
     fn start(&mut self, stamp_ns: i64, points: &[TrackPoint], continued: &[Option<usize>]) {
         let Some(origin) = points.first().map(|p| p.position_map) else { return };
-        let mut taken = Spacing::new(self.config.spacing_m, origin);
-        for p in self.live.iter().filter_map(|t| t.points.last()) {
-            taken.add(moved(p, stamp_ns));
-        }
         let fresh = |p: &TrackPoint| {
             let opaque = f64::from(p.opacity) >= self.config.min_opacity;
-            opaque && p.velocity_map_mps.length() >= self.config.min_speed_mps
+            opaque && p.may_start && p.velocity_map_mps.length() >= self.config.min_speed_mps
         };
         let mut candidates: Vec<&TrackPoint> =
             points.iter().zip(continued).filter(|(p, c)| c.is_none() && fresh(p)).map(|(p, _)| p).collect();
+        if candidates.is_empty() {
+            return;
+        }
+        let about = self.live.len() + candidates.len();
+        let mut taken = Spacing::new(self.config.spacing_m, origin, about);
+        self.live.iter().filter_map(|t| t.predicted(stamp_ns)).for_each(|p| taken.add(p));
         // Stable, so points equally opaque stay in the caller's order.
         candidates.sort_by(|a, b| b.opacity.total_cmp(&a.opacity));
         for p in candidates {
             if self.live.len() >= self.config.max_active {
                 self.counts.no_room += 1;
             } else if taken.claim(p.position_map) {
-                self.live.push(Track { id: self.next_id, points: vec![sample(stamp_ns, p)] });
+                self.live.push(Track::new(self.next_id, stamp_ns, p));
                 self.next_id = self.next_id.wrapping_add(1);
                 self.counts.born += 1;
             }
@@ -181,7 +154,7 @@ impl Tracker {
     fn end_where(&mut self, ended: impl Fn(&Track) -> bool) {
         let min_points = self.config.min_points;
         for track in self.live.extract_if(.., |t| ended(t)) {
-            if track.points.len() >= min_points {
+            if track.len() >= min_points {
                 self.counts.finished += 1;
                 self.finished.push(track);
             } else {
@@ -191,18 +164,9 @@ impl Tracker {
     }
 }
 
-/// Where a trajectory's end is at `stamp_ns`, moved by its own flow.
-fn moved(end: &TrackSample, stamp_ns: i64) -> DVec3 {
-    end.position_map + end.velocity_map_mps * seconds_between(end.stamp_ns, stamp_ns)
-}
-
-fn sample(stamp_ns: i64, p: &TrackPoint) -> TrackSample {
-    let TrackPoint { position_map, velocity_map_mps, motion_id, .. } = *p;
-    TrackSample { stamp_ns, position_map, velocity_map_mps, motion_id }
-}
-
 fn plausible(p: &TrackPoint) -> bool {
     let finite = p.position_map.is_finite() && p.velocity_map_mps.is_finite() && p.opacity.is_finite();
+    let finite = finite && p.color01.iter().chain([&p.distance_m]).all(|x| x.is_finite());
     finite && p.velocity_map_mps.length() <= MAX_SPEED_MPS && p.position_map.length() <= crate::poses::MAX_POSITION_M
 }
 

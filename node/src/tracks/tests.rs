@@ -5,7 +5,8 @@ use super::*;
 const MS: i64 = 1_000_000;
 
 fn point(p: DVec3, v: DVec3) -> TrackPoint {
-    TrackPoint { position_map: p, velocity_map_mps: v, opacity: 0.9, motion_id: 3 }
+    let (color01, distance_m, may_start) = ([0.5; 3], 10.0, true);
+    TrackPoint { position_map: p, velocity_map_mps: v, opacity: 0.9, motion_id: 3, color01, distance_m, may_start }
 }
 
 /// Points on the back of a vehicle, 0.1 m apart, sampled a little differently at each step as pixels are.
@@ -112,23 +113,97 @@ fn crossing_vehicles_keep_their_trajectories() {
     }
 }
 
+#[test]
+fn a_point_of_another_colour_is_another_point() {
+    let v = DVec3::new(5.0, 0.0, 0.0);
+    let paint = |step: i64| if step < 5 { [0.9, 0.1, 0.1] } else { [0.1, 0.1, 0.9] };
+    let (t, tracks) = run(&[100; 20], |time, i| vec![TrackPoint { color01: paint(i), ..point(v * time, v) }]);
+    assert_eq!(tracks.iter().map(|t| t.points.len()).collect::<Vec<_>>()[0], 5);
+    assert!(t.counts().unlike > 0 && tracks.len() == 2, "{tracks:?}");
+    // Light that changes slowly is no other colour.
+    let (_, tracks) =
+        run(&[100; 20], |time, i| vec![TrackPoint { color01: [0.04 * i as f32; 3], ..point(v * time, v) }]);
+    assert_eq!(tracks.iter().map(|t| t.points.len()).collect::<Vec<_>>(), [20]);
+}
+
+#[test]
+fn where_the_map_stands_nothing_starts() {
+    let v = DVec3::new(5.0, 0.0, 0.0);
+    let (t, _) = run(&[100; 5], |time, _| vec![TrackPoint { may_start: false, ..point(v * time, v) }]);
+    assert_eq!(t.counts().born, 0);
+}
+
+#[test]
+fn places_between_steps_follow_the_curve() {
+    // Braking: x = 10 t - t^2, exactly a Hermite cubic's own.
+    let x = |t: f64| DVec3::X * (10.0 * t - t * t);
+    let v = |t: f64| DVec3::X * (10.0 - 2.0 * t);
+    let (_, tracks) = run(&[500; 6], |time, _| vec![point(x(time), v(time))]);
+    let track = &tracks[0];
+    for ms in [500, 601, 999, 1000, 2749, 3000] {
+        let t = ms as f64 * 1e-3;
+        let (position, velocity) = track.at(ms * MS).unwrap();
+        assert!((position - x(t)).length() < 1e-9 && (velocity - v(t)).length() < 1e-9, "{ms}: {position} {velocity}");
+    }
+    assert!(track.at(499 * MS).is_none() && track.at(3001 * MS).is_none());
+}
+
+#[test]
+fn uncertain_speeds_get_a_wider_gate() {
+    // A pedestrian whose speed is off by 3 m/s from step to step: half a metre would lose it at half-second steps.
+    let off = |i: i64| DVec3::new(0.0, if i % 2 == 0 { 1.5 } else { -1.5 }, 0.0);
+    let v = DVec3::new(1.5, 0.0, 0.0);
+    let (_, tracks) = run(&[500; 12], |time, i| vec![point(v * time, v + off(i))]);
+    assert_eq!(tracks.iter().map(|t| t.points.len()).collect::<Vec<_>>(), [12]);
+}
+
+#[test]
+fn a_lead_vehicle_that_never_leaves_takes_no_more_memory() {
+    let v = DVec3::new(10.0, 0.0, 0.0);
+    let mut t = Tracker::new(&TracksConfig::default());
+    let mut rows = Vec::new();
+    for step in 0..5000i64 {
+        let time = step as f64 * 0.1;
+        t.step(step * 100 * MS, 0, &[point(v * time, v)]);
+        assert!(t.live()[0].points.len() <= 601);
+        rows.extend(t.drain().into_iter().flat_map(|t| t.points.into_iter().map(move |p| (t.id, p.stamp_ns))));
+    }
+    rows.extend(t.finish().into_iter().flat_map(|t| t.points.into_iter().map(move |p| (t.id, p.stamp_ns))));
+    assert_eq!((rows.len(), t.counts().finished), (5000, 1));
+    assert!(rows.windows(2).all(|r| r[0].0 == r[1].0 && r[0].1 < r[1].1), "each point once, in order");
+}
+
 /// A measurement, not a check: `cargo test --release -p storm-node --lib tracks::tests::rate -- --ignored --nocapture`.
 #[test]
 #[ignore = "timing"]
 fn rate() {
     let v = DVec3::new(10.0, 0.0, 0.0);
-    let mut t = Tracker::new(&TracksConfig::default());
-    let mut times_ms = Vec::new();
-    for step in 0..20 {
-        let points: Vec<_> = (0..40)
+    let config = TracksConfig { spacing_m: 0.08, max_active: 20_000, ..Default::default() };
+    let mut t = Tracker::new(&config);
+    let (mut wall, mut cpu) = (Vec::new(), Vec::new());
+    for step in 0..60 {
+        let points: Vec<_> = (0..80)
             .flat_map(|c| vehicle(DVec3::new(0.0, 4.0 * f64::from(c), 0.0) + v * 0.1 * step as f64, v, step))
             .collect();
-        let start = std::time::Instant::now();
+        let (start, cpu_start) = (std::time::Instant::now(), crate::soak::cpu_ms().unwrap_or(0.0));
         t.step(step * 100 * MS, 0, &points);
-        times_ms.push(start.elapsed().as_secs_f64() * 1e3);
+        if step > 5 {
+            wall.push(start.elapsed().as_secs_f64() * 1e3);
+            cpu.push(crate::soak::cpu_ms().unwrap_or(0.0) - cpu_start);
+        }
     }
-    times_ms.sort_by(f64::total_cmp);
-    println!("10,080 points: p50 {:.1} ms, worst {:.1} ms; {} live", times_ms[10], times_ms[19], t.live().len());
+    wall.sort_by(f64::total_cmp);
+    cpu.sort_by(f64::total_cmp);
+    let n = wall.len();
+    println!(
+        "20,160 points, {} live, {} threads: wall p50 {:.1}, worst {:.1} ms; CPU p50 {:.1}, worst {:.1} ms",
+        t.live().len(),
+        rayon::current_num_threads(),
+        wall[n / 2],
+        wall[n - 1],
+        cpu[n / 2],
+        cpu[n - 1]
+    );
 }
 
 fn wild_point() -> impl Strategy<Value = (f64, f64, f64, f32)> {
@@ -172,7 +247,7 @@ proptest! {
             for p in t.points.windows(2) {
                 let dt_sec = seconds_between(p[0].stamp_ns, p[1].stamp_ns);
                 let predicted = p[0].position_map + p[0].velocity_map_mps * dt_sec;
-                prop_assert!(predicted.distance(p[1].position_map) <= 0.5 + 1e-9);
+                prop_assert!(predicted.distance(p[1].position_map) <= 2.0 + 1e-3);
             }
         }
     }

@@ -35,9 +35,10 @@ const TOP_VIEW_PX: usize = 900;
 const TRACKS_DRAWN: usize = 2_000;
 
 /// What a run's folder holds besides the report.
-const FILES: [(&str, &str); 6] = [
+const FILES: [(&str, &str); 7] = [
     ("map.ply", "static map, 3DGS layout, without the sky"),
     ("tracks.csv", "point trajectories, map frame"),
+    ("objects.csv", "moving objects: boxes and velocities, map frame"),
     ("outputs.mcap", "what a live node publishes; opens in Foxglove"),
     ("trajectory.tum", "vehicle poses"),
     ("metrics.json", "counts, drops, stage times, error figures"),

@@ -14,12 +14,15 @@ use anyhow::{Context, Result};
 use crate::config::Config;
 use crate::engine::Engine;
 use crate::engine::score::Scorer;
+use crate::objects::MovingObject;
+use crate::output::objects_csv::ObjectsWriter;
 use crate::output::ply::{PlyCloud, write_ply};
-use crate::output::tracks_csv::{TrackRow, write_tracks_csv};
+use crate::output::tracks_csv::{TrackRow, TracksWriter};
 use crate::output::tum::write_tum;
 use crate::rigid::Rigid;
 use crate::source::topics::TruthKind;
 use crate::source::{Frame, Rig};
+use crate::tracks::Track;
 use crate::window::PosedSet;
 
 use super::front::TruthImage;
@@ -27,6 +30,9 @@ use super::metrics::{Counts, Metrics};
 use super::step::{Finished, Step};
 use super::timing::{Timings, peak_rss_mb};
 use gallery::{Gallery, Run};
+
+/// Most trajectory rows kept for the report's picture: some 2,000 trajectories of two seconds.
+const ROWS_DRAWN: usize = 40_000;
 
 /// One thing to write.
 pub enum SinkInput {
@@ -50,6 +56,10 @@ pub enum SinkInput {
     },
     /// A step's result.
     Step(Arc<Step>),
+    /// Trajectories that have ended.
+    Tracks(Vec<Track>),
+    /// Moving objects that have ended.
+    Objects(Vec<MovingObject>),
 }
 
 /// The writer's state over a run.
@@ -66,6 +76,10 @@ pub struct Sink {
     last_gaussians: u64,
     epochs: u32,
     timings: Timings,
+    tracks: TracksWriter,
+    objects: ObjectsWriter,
+    /// The first ones, for the report.
+    drawn: Vec<TrackRow>,
 }
 
 impl Sink {
@@ -92,6 +106,9 @@ impl Sink {
             last_gaussians: 0,
             epochs: 0,
             timings: Timings::default(),
+            tracks: TracksWriter::create(&out.join("tracks.csv"))?,
+            objects: ObjectsWriter::create(&out.join("objects.csv"))?,
+            drawn: Vec::new(),
         })
     }
 
@@ -111,6 +128,8 @@ impl Sink {
                     scorer.truth(camera, stamp_ns, kind, image);
                 }
             }
+            SinkInput::Objects(ended) => self.write_objects(&ended)?,
+            SinkInput::Tracks(ended) => self.write_tracks(&ended)?,
             SinkInput::Step(step) => {
                 self.last_gaussians = step.scene.gaussians.len() as u64;
                 if let Some(publisher) = &mut self.publisher {
@@ -126,19 +145,43 @@ impl Sink {
         Ok(())
     }
 
+    fn write_objects(&mut self, ended: &[MovingObject]) -> Result<()> {
+        for object in ended {
+            self.objects.write(object)?;
+        }
+        Ok(())
+    }
+
+    /// Rows of trajectories that have ended, handed to the system at once.
+    fn write_tracks(&mut self, ended: &[Track]) -> Result<()> {
+        for track in ended {
+            let rows: Vec<TrackRow> = track_rows(track).collect();
+            self.tracks.write(&rows)?;
+            if self.drawn.len() + rows.len() <= ROWS_DRAWN {
+                self.drawn.extend(rows);
+            }
+        }
+        self.tracks.flush()?;
+        Ok(())
+    }
+
     /// Writes what is written once, at the end.
     pub fn finish(
-        self,
+        mut self,
         finished: Finished,
         counts: Counts,
         weights: String,
         model: String,
         wall: Duration,
     ) -> Result<Metrics> {
-        let Self { out, config, publisher, scorer, gallery, poses, .. } = self;
+        self.write_tracks(&finished.tracks)?;
+        self.write_objects(&finished.objects)?;
+        let Self { out, config, publisher, scorer, gallery, poses, tracks, objects, drawn: rows, .. } = self;
+        tracks.finish()?;
+        objects.finish()?;
         let place = |name: &str| out.join(name);
         let origin = finished.map.origin();
-        let map = finished.map.cloud();
+        let map = finished.map.cloud().context("the map cannot be read back")?;
         let cloud = PlyCloud {
             positions: map.positions.clone(),
             colors01: map.colors01.clone(),
@@ -151,8 +194,6 @@ impl Sink {
             "static map without the sky; positions in metres, relative to origin_m in the map frame".to_string(),
         ];
         write_ply(&place("map.ply"), &cloud, origin.to_array(), &notes)?;
-        let rows: Vec<TrackRow> = finished.tracks.iter().flat_map(track_rows).collect();
-        write_tracks_csv(&place("tracks.csv"), &rows)?;
         write_tum(&place("trajectory.tum"), poses.iter().copied())?;
         std::fs::write(place("config.yaml"), config.to_yaml()).context("cannot write config.yaml")?;
         let published = match publisher {
@@ -189,9 +230,14 @@ impl Sink {
             recorded_sec: recorded_ns as f64 * 1e-9,
             gaussians: self.last_gaussians,
             gaussians_left_out: published.truncated,
-            map_gaussians: cloud.len() as u64,
+            map_gaussians: finished.map.len() as u64,
+            map: finished.map.counts(),
+            map_mb: finished.map.bytes() as f64 / f64::from(1 << 20),
+            map_saves_failed: finished.map_saves_failed,
             map_evicted: finished.map.counts().evicted,
-            tracks: finished.tracks.len() as u64,
+            tracks: finished.track_counts.finished,
+            track_counts: finished.track_counts,
+            objects: finished.object_counts,
             origin_m: origin.to_array(),
             epochs: self.epochs,
             held_out,
@@ -205,7 +251,7 @@ impl Sink {
     }
 }
 
-fn track_rows(track: &crate::tracks::Track) -> impl Iterator<Item = TrackRow> + '_ {
+fn track_rows(track: &Track) -> impl Iterator<Item = TrackRow> + '_ {
     track.points.iter().map(|p| TrackRow {
         track_id: track.id,
         stamp_ns: p.stamp_ns,

@@ -1,0 +1,57 @@
+//! `storm map`: what a saved map holds, and the map as PLY.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+
+use super::Outcome;
+use crate::map::StaticMap;
+use crate::output::ply::{PlyCloud, write_ply};
+
+/// Arguments of `storm map`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Folder of a saved map: `map/` of a results folder, also of a run that was killed.
+    map: PathBuf,
+    /// Write the map in the 3DGS layout.
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Load what is whole when tiles are damaged; each damaged one is named.
+    #[arg(long)]
+    salvage: bool,
+}
+
+/// Loads, checks, says, writes.
+pub fn run(args: &Args) -> Result<Outcome> {
+    let (map, problems) = StaticMap::open(&args.map, args.salvage)?;
+    for problem in &problems {
+        eprintln!("lost: {problem}");
+    }
+    let o = map.origin();
+    println!(
+        "{} Gaussians in {} tiles of {} m, finest voxels {} m, {:.1} MB on disk; origin {} {} {}; {} windows",
+        map.len(),
+        map.tile_count(),
+        map.config().tile_m,
+        map.config().voxel_m,
+        map.disk_bytes() as f64 / 1e6,
+        o.x,
+        o.y,
+        o.z,
+        map.revision()
+    );
+    if let Some(path) = &args.out {
+        let cloud = map.cloud()?;
+        let notes =
+            ["static map without the sky; positions in metres, relative to origin_m in the map frame".to_string()];
+        let ply = PlyCloud {
+            positions: cloud.positions,
+            colors01: cloud.colors01,
+            opacities: cloud.opacities,
+            scales: cloud.scales,
+            quats: cloud.quats,
+        };
+        write_ply(path, &ply, cloud.origin.to_array(), &notes)?;
+    }
+    Ok(if problems.is_empty() { Outcome::Done } else { Outcome::Lost })
+}

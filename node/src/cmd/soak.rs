@@ -1,0 +1,167 @@
+//! `storm soak`: long procedural drives through the map and the trackers, without a network.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use storm_render::world::DriveOptions;
+
+use super::{Outcome, UsageError, progress_bar};
+use crate::config::Config;
+use crate::soak::{OracleErrors, SoakOptions, SoakReport, run as soak};
+
+/// Arguments of `storm soak`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Seed of the drive.
+    #[arg(long, default_value_t = 10_000)]
+    seed: u64,
+    /// Length of the drive, seconds.
+    #[arg(long, default_value_t = 60.0)]
+    seconds: f64,
+    /// Picture size, WIDTHxHEIGHT.
+    #[arg(long, default_value = "96x64")]
+    size: String,
+    /// Sets a second.
+    #[arg(long, default_value_t = 10.0)]
+    rate: f64,
+    /// Cameras.
+    #[arg(long, default_value_t = 3)]
+    cameras: usize,
+    /// Error of depth, standard deviation as a part of depth.
+    #[arg(long, default_value_t = 0.0)]
+    depth_error: f64,
+    /// Error of velocity, standard deviation per component, m/s.
+    #[arg(long, default_value_t = 0.0)]
+    velocity_error: f64,
+    /// Chance that a road user is taken for standing, per picture.
+    #[arg(long, default_value_t = 0.0)]
+    missed: f64,
+    /// Only times and memory: no pictures, surfaces and ghosts.
+    #[arg(long)]
+    no_quality: bool,
+    /// Folder for the map's tiles; a temporary one when not given.
+    #[arg(long)]
+    map: Option<PathBuf>,
+    /// Threads; 0: all cores.
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Write everything as JSON.
+    #[arg(long)]
+    json: Option<PathBuf>,
+    /// Configuration file; `map`, `tracks` and `window` count.
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Single configuration values, key=value.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+/// Drives, prints the figures.
+pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
+    let wrong = || UsageError(format!("--size '{}' is not WIDTHxHEIGHT", args.size));
+    let (width, height) = args.size.split_once('x').ok_or_else(wrong)?;
+    let (width, height) = (width.parse().map_err(|_| wrong())?, height.parse().map_err(|_| wrong())?);
+    let mut config = match &args.config {
+        Some(path) => Config::load(path)?,
+        None => Config::default(),
+    };
+    for assignment in &args.set {
+        config = config.with_override(assignment)?;
+    }
+    config.validate()?;
+    let drive = DriveOptions {
+        seed: args.seed,
+        seconds: args.seconds,
+        width,
+        height,
+        rate_hz: args.rate,
+        cameras: args.cameras,
+        // The oracle has no exposure of its own to undo.
+        exposure: false,
+        noise: 0.0,
+        ..DriveOptions::default()
+    };
+    drive.check().map_err(|e| UsageError(e.to_string()))?;
+    let errors = OracleErrors { depth: args.depth_error, velocity_mps: args.velocity_error, missed: args.missed };
+    let temporary = tempfile::tempdir().context("no temporary folder")?;
+    let map_dir = args.map.clone().unwrap_or_else(|| temporary.path().to_path_buf());
+    let options = SoakOptions { drive, errors, quality: !args.no_quality, map_dir: Some(map_dir), config };
+    let bar = progress_bar(progress, (args.seconds * args.rate) as u64, "driving");
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build()?;
+    let report = pool.install(|| soak(&options, &|done| bar.set_position(done as u64)))?;
+    bar.finish_and_clear();
+    print(&report);
+    if let Some(path) = &args.json {
+        let json = serde_json::to_string_pretty(&report)?;
+        std::fs::write(path, json + "\n").with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn print(r: &SoakReport) {
+    println!(
+        "seed {}: {:.0} s, {:.0} m, {} windows of {} Gaussians, {} threads",
+        r.seed, r.seconds, r.metres, r.steps, r.gaussians, r.threads
+    );
+    for (name, t) in [("fuse", &r.fuse_ms), ("tracks", &r.track_ms), ("objects", &r.object_ms)] {
+        println!(
+            "{name:8} p50 {:.1} ms, p99 {:.1} ms; processor time p50 {:.1} ms, p99 {:.1} ms",
+            t.p50, t.p99, t.cpu_p50, t.cpu_p99
+        );
+    }
+    println!("quarter  step p99 ms   processor p99 ms   resident MB (mean, most)   map Gaussians in memory");
+    for (i, q) in r.quarters.iter().enumerate() {
+        println!(
+            "{:7}  {:11.1}   {:16.1}   {:12.0} {:10.0}   {:23}",
+            i + 1,
+            q.step_ms.p99,
+            q.step_ms.cpu_p99,
+            q.rss_mb[0],
+            q.rss_mb[1],
+            q.map_gaussians[0]
+        );
+    }
+    println!(
+        "map      {} Gaussians, {:.0} MB in memory, {:.0} MB on disk; {:?}",
+        r.map_gaussians, r.map_mb, r.map_disk_mb, r.map
+    );
+    println!("tracks   {} alive at most; {:?}", r.live_tracks, r.tracks);
+    let show = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.3}"));
+    if let Some(q) = &r.map_quality {
+        println!(
+            "static PSNR at {} held-out poses: window {} dB, map {} dB; covered {}",
+            q.pictures,
+            show(q.window_psnr),
+            show(q.map_psnr),
+            show(q.covered)
+        );
+        println!(
+            "within 0.2 m up to 20 m: accuracy {} (mean error {} m), completeness {}; left by moving things: {} of the mass, {} of the Gaussians",
+            show(q.accuracy),
+            show(q.error_m),
+            show(q.completeness),
+            q.ghost_share.map_or("-".into(), |x| format!("{x:.5}")),
+            q.ghost_gaussians.map_or("-".into(), |x| format!("{x:.5}"))
+        );
+    }
+    if let Some(o) = &r.object_quality {
+        println!(
+            "objects  ARI {}, moving pixels covered {}, velocity off by {} m/s; {} road users, {:.2} objects and {:.2} switches each",
+            show(o.fg_ari),
+            show(o.covered),
+            show(o.velocity_error_mps),
+            o.road_users,
+            o.objects_each,
+            o.switches_each
+        );
+    }
+    if let Some(t) = &r.track_quality {
+        println!(
+            "{} trajectories on road users ({} astray, {:.1} each), {:.2} s long on average; {} switched; velocity off by {:.3} m/s",
+            t.judged, t.astray, t.per_mover, t.mean_life_sec, t.switches, t.velocity_error_mps
+        );
+        for (name, s) in [("chained", &t.tracks), ("constant velocity", &t.constant_velocity)] {
+            println!("{name:18} APD3D {}, OA {}", show(s.apd3d), show(s.occlusion_accuracy));
+        }
+    }
+}
