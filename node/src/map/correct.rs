@@ -80,7 +80,8 @@ impl StaticMap {
             let old = origin + corner + cell.position.as_dvec3();
             let place = (new_from_old.apply(old) - origin) / tile_m;
             let index = place.floor();
-            if !(index.abs().max_element() < f64::from(i32::MAX / 2)) {
+            let inside = index.abs().max_element() < f64::from(i32::MAX / 2);
+            if !inside {
                 counts.rejected += 1;
                 continue;
             }

@@ -67,7 +67,7 @@ impl Carver {
             }
         }
         let farthest = nearest.iter().copied().fold(0.0, f32::max);
-        (farthest > 0.0).then(|| Self { map_from_camera: view.map_from_camera, intrinsics: k, nearest, farthest })
+        (farthest > 0.0).then_some(Self { map_from_camera: view.map_from_camera, intrinsics: k, nearest, farthest })
     }
 
     /// For a tile whose corner is at `corner` of the map; none when the tile is out of sight or farther than `reach_m`.

@@ -95,14 +95,18 @@ fn standing(look: &SceneLook, config: &MapConfig) -> Vec<bool> {
     let (mut moves, groups): (Vec<bool>, Vec<u16>) = (0..g.len())
         .into_par_iter()
         .with_min_len(1024)
-        .map(|i| (!(speed_mps(scene, i) <= gate), if grouped { g.motion_id(i) } else { 0 }))
+        .map(|i| {
+            let stands = speed_mps(scene, i) <= gate;
+            (!stands, if grouped { g.motion_id(i) } else { 0 })
+        })
         .unzip();
     let group_moves = moving_groups(look, config, &moves, &groups);
     let newest = (shape.timesteps - 1) * shape.cameras;
     for (c, view) in look.rendered.iter().enumerate().take(shape.cameras) {
         let Some(flow) = view.flow.as_ref().filter(|f| f.len() == pixels) else { continue };
         for (p, v) in flow.iter().enumerate() {
-            moves[(newest + c) * pixels + p] |= !(Vec3::from(*v).length() <= gate);
+            let stands = Vec3::from(*v).length() <= gate;
+            moves[(newest + c) * pixels + p] |= !stands;
         }
     }
     // The colours of a pixel beside a moving surface are mixed with it.

@@ -328,8 +328,7 @@ impl Tile {
     /// True when cells and table agree; for tests.
     #[cfg(test)]
     pub fn is_consistent(&self) -> bool {
-        let dead = self.cells.iter().filter(|c| !(c.support > 0.0)).count();
-        dead == self.dead
+        self.live().count() == self.len()
             && self.cells.iter().enumerate().filter(|(_, c)| c.support > 0.0).all(|(i, c)| {
                 let mut marked = std::iter::successors(parent(c.key), |&k| parent(k));
                 self.table.get(c.key) == Slot::Cell(i as u32) && marked.all(|k| self.table.get(k) == Slot::Refined)

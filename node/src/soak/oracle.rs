@@ -101,7 +101,8 @@ impl OracleSet {
             .map(|i| {
                 let (row, col, depth) = (i / w, i % w, frame.depth[i]);
                 let ray = k.ray(col as f32 + 0.5, row as f32 + 0.5);
-                if !(depth > 0.0) {
+                let hit = depth > 0.0;
+                if !hit {
                     return ([0.0; 3], [1.0, 0.0, 0.0, 0.0], [1e-3; 3], 0.0, 0.0);
                 }
                 let here = at(i);
