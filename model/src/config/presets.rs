@@ -116,7 +116,7 @@ impl ModelConfig {
             color: ColorBase::Residual,
             sky: SkyKind::Frequency64,
             affine: AffineKind::MatrixBias,
-            flow_gate_mps: 0.0,
+            flow_gate_mps: 1.0,
             velocity_scale: 10.0,
             velocity_bases: VelocityBases::Spread,
             ..Self::default()
