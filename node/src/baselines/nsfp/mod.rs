@@ -60,7 +60,7 @@ fn sample(points: &[[f32; 3]], dice: &mut Dice) -> Vec<[f32; 3]> {
     order.into_iter().map(|i| points[i]).collect()
 }
 
-/// Which points are ground: those less than [`GROUND_M`] above the lowest point of their cell (z is up).
+/// Which points are ground: those less than `GROUND_M` above the lowest point of their cell (z is up).
 pub fn ground(points: &[[f32; 3]]) -> Vec<bool> {
     let cell = |p: &[f32; 3]| ((p[0] / GROUND_CELL_M).floor() as i64, (p[1] / GROUND_CELL_M).floor() as i64);
     let mut lowest: BTreeMap<(i64, i64), f32> = BTreeMap::new();

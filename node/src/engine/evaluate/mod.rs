@@ -2,7 +2,7 @@
 //! and compared; flow, motion masks and trajectories are scored on the context frames.
 //!
 //! The data's way: [`Clip`] (a procedural drive, or a piece of a bag) -> a [`Method`] -> [`Prediction`] -> [`Tally`] ->
-//! [`Figures`](super::figures::Figures).
+//! [`Figures`].
 
 pub mod bag;
 mod clip;
