@@ -14,6 +14,9 @@ const AGAINST_PLAIN: f64 = 3e-5;
 const AGAINST_DIFFERENCES: f64 = 2e-5;
 /// Step of the differences in f64: its square is far under f32's rounding, and so is f64's rounding over it.
 const STEP: f64 = 1e-4;
+/// Gradients smaller than this are what is left of terms near 1 (of a layer norm over two columns only what eps adds), and carry
+/// those terms' rounding.
+const CANCELLED: f64 = 0.03;
 /// A usual eps divides rounding by rounding where rows are nearly constant (a single column).
 const EPS: f64 = 1e-3;
 
@@ -45,7 +48,7 @@ fn check(inputs: &[Tensor], fast: impl Fn(&[Tensor]) -> Result<Tensor>, plain: i
     let want = loss(&plain(&vars).unwrap()).backward().unwrap();
     for (i, var) in vars.iter().enumerate() {
         let (got, want) = (gradient(&got, var), gradient(&want, var));
-        let size = want.iter().fold(1e-3, |a: f64, w| a.max(w.abs()));
+        let size = want.iter().fold(CANCELLED, |a: f64, w| a.max(w.abs()));
         for (g, w) in got.iter().zip(&want) {
             assert!((g - w).abs() <= AGAINST_PLAIN * size, "input {i} {:?}: {g} and plain's {w}", var.dims());
         }
@@ -61,7 +64,7 @@ fn check(inputs: &[Tensor], fast: impl Fn(&[Tensor]) -> Result<Tensor>, plain: i
         };
         let difference = (at(STEP) - at(-STEP)) / (2.0 * STEP);
         let terms: Vec<f64> = gradient(&got, var).iter().zip(flat(&direction)).map(|(g, d)| g * d).collect();
-        let (sum, size) = (terms.iter().sum::<f64>(), terms.iter().map(|t| t.abs()).sum::<f64>().max(1e-3));
+        let (sum, size) = (terms.iter().sum::<f64>(), terms.iter().map(|t| t.abs()).sum::<f64>().max(CANCELLED));
         assert!(
             (sum - difference).abs() <= AGAINST_DIFFERENCES * size,
             "input {i} {:?}: {sum} along a direction, differences say {difference}",
@@ -77,7 +80,7 @@ fn layer(inputs: &[Tensor], weight: usize, bias: Option<usize>) -> Linear {
 const ACTIVATIONS: [Activation; 3] = [Activation::None, Activation::Gelu, Activation::Silu];
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(16))]
+    #![proptest_config(ProptestConfig::with_cases(64))]
 
     #[test]
     fn linear_gradients(
