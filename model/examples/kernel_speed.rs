@@ -3,6 +3,8 @@
 //! `cargo run --release -p storm-model --example kernel_speed [attention|linear|mlp|norm]`; best and median of a few runs,
 //! and processor time, which is the one to read on a machine that others use.
 
+mod common;
+
 use std::time::Instant;
 
 use candle_core::{Device, Result, Tensor};
@@ -10,22 +12,14 @@ use storm_model::kernels::{Isa, peak};
 use storm_model::ops::{self, Activation, Linear};
 use storm_model::plain;
 
+use common::cpu_seconds;
+
 /// Timed runs of each case, after one that is not.
 const RUNS: usize = 3;
 /// Multiply-add steps of the peak loop: about 10 ms.
 const PEAK_STEPS: usize = 5_000_000;
 /// Its runs, of which the best counts.
 const PEAK_RUNS: usize = 20;
-
-/// Seconds all threads of this process have run (Linux), which other programs on the machine do not inflate.
-fn cpu_seconds() -> Option<f64> {
-    let mut nanoseconds = 0f64;
-    for task in std::fs::read_dir("/proc/self/task").ok()? {
-        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-        nanoseconds += text.split_whitespace().next()?.parse::<f64>().ok()?;
-    }
-    Some(nanoseconds * 1e-9)
-}
 
 /// Seconds of one run.
 #[derive(Clone, Copy)]

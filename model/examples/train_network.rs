@@ -5,6 +5,8 @@
 //! 4 timesteps; the loss is the mean square of what the network says about every pixel (nothing is drawn). Best wall and
 //! processor time of a few steps, as JSON. `CANDLE_NUM_THREADS=2` shows what candle's own thread pool costs.
 
+mod common;
+
 use std::time::Instant;
 
 use candle_core::{Device, Tensor, Var};
@@ -13,17 +15,10 @@ use storm_model::weights::{Tensors, untrained};
 use storm_model::{ClipBatch, ClipOutput, ModelConfig, ModelError, PixelLayout, Storm, ViewInput};
 use storm_render::Intrinsics;
 
+use common::cpu_seconds;
+
 /// Timesteps of a window.
 const TIMESTEPS: usize = 4;
-
-fn cpu_seconds() -> Option<f64> {
-    let mut nanoseconds = 0f64;
-    for task in std::fs::read_dir("/proc/self/task").ok()? {
-        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-        nanoseconds += text.split_whitespace().next()?.parse::<f64>().ok()?;
-    }
-    Some(nanoseconds * 1e-9)
-}
 
 fn clip(config: &ModelConfig, batch: usize, cameras: usize) -> Result<ClipBatch, ModelError> {
     let (height, width) = (config.image_height, config.image_width);

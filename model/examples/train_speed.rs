@@ -7,12 +7,16 @@
 //! `tests/python/peer_training.py` is the same step in PyTorch. Wall and processor time are printed as JSON; on a machine
 //! that others use, the processor time is the one to compare.
 
+mod common;
+
 use std::time::Instant;
 
 use candle_core::{Device, Result, Tensor, Var};
 use candle_nn::{AdamW, Optimizer, ParamsAdamW};
 use storm_model::ops::{self, Activation, Linear};
 use storm_model::plain;
+
+use common::cpu_seconds;
 
 /// Inputs of a token: 8 x 8 pixels of 9 channels.
 const PATCH_INPUTS: usize = 576;
@@ -24,16 +28,6 @@ const HEAD_DIM: usize = 32;
 const NORM_EPS: f64 = 1e-6;
 /// Spread of the starting weights.
 const START_SPREAD: f32 = 0.02;
-
-/// Seconds all threads of this process have run (Linux), which other programs on the machine do not inflate.
-fn cpu_seconds() -> Option<f64> {
-    let mut nanoseconds = 0f64;
-    for task in std::fs::read_dir("/proc/self/task").ok()? {
-        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-        nanoseconds += text.split_whitespace().next()?.parse::<f64>().ok()?;
-    }
-    Some(nanoseconds * 1e-9)
-}
 
 /// Which operations the network is made of.
 #[derive(Clone, Copy)]

@@ -3,6 +3,7 @@ use proptest::prelude::*;
 use storm_render::{Gaussians, Intrinsics};
 
 use super::*;
+use crate::pipeline::timing::cpu_ms;
 use crate::rigid::Rigid;
 
 fn config(voxel_m: f64, max_gaussians: usize) -> MapConfig {
@@ -484,14 +485,6 @@ fn a_late_loop_closure_moves_tiles_and_brings_two_passes_together() {
     assert_eq!(loaded.cloud().unwrap(), c);
 }
 
-/// Time this process has run, all threads, ms, without what other programs took (Linux; 0 elsewhere).
-fn cpu_ms() -> f64 {
-    let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let fields: Vec<f64> = text.rsplit(')').next().unwrap_or("").split_whitespace().flat_map(str::parse).collect();
-    // utime and stime are fields 14 and 15, in hundredths of a second; field 3 (a letter) does not parse.
-    fields.get(10).zip(fields.get(11)).map_or(0.0, |(u, s)| 10.0 * (u + s))
-}
-
 /// A measurement, not a check: `cargo test --release -p storm-node --lib map::tests::rate -- --ignored --nocapture`.
 #[test]
 #[ignore = "timing"]
@@ -515,7 +508,7 @@ fn rate() {
         (0..12).map(|p| Eye { position: Vec3::X * (-5.0 * (3 - p / 3) as f32), pixel_rad: 1.0 / k.fx }).collect();
     let mut map = StaticMap::new(&MapConfig::default());
     let (mut wall_ms, first_new) = (Vec::new(), 9 * w * h);
-    let start_ms = cpu_ms();
+    let start_ms = cpu_ms().unwrap_or(0.0);
     let steps = 200;
     for step in 0..steps {
         let pose = Rigid::new(DQuat::from_rotation_z(0.002 * f64::from(step)), DVec3::X * f64::from(step));
@@ -540,7 +533,7 @@ fn rate() {
         map.fuse(&window, |i| Some(confidence(g.opacities[i], 10.0)), |i| color01(&g.colors[i]));
         wall_ms.push(start.elapsed().as_secs_f64() * 1e3);
     }
-    let cpu = (cpu_ms() - start_ms) / f64::from(steps);
+    let cpu = (cpu_ms().unwrap_or(0.0) - start_ms) / f64::from(steps);
     wall_ms.sort_by(f64::total_cmp);
     let at = |q: f64| wall_ms[(q * f64::from(steps - 1)) as usize];
     println!(

@@ -2,11 +2,13 @@
 
 use tracing::warn;
 
-use crate::config::SyncConfig;
+use crate::config::{Config, SyncConfig};
 use crate::msg::TransformStamped;
 use crate::poses::{PoseBuffer, PoseGate, PoseLookup};
 use crate::rigid::Rigid;
 use crate::source::Rig;
+use crate::source::bag::BagSource;
+use crate::source::topics::PoseTopic;
 use crate::sync::{DropCounts, FrameSet};
 use crate::tf::TfTree;
 use crate::window::PosedSet;
@@ -30,6 +32,18 @@ pub enum PoseStore {
 }
 
 impl PoseStore {
+    /// Empty, for the pose topic a bag was planned with; a tree starts from the bag's static transforms.
+    pub fn of_bag(source: &BagSource, rig: &Rig, config: &Config) -> Self {
+        match source.plan().pose {
+            PoseTopic::Message(_) => Self::Buffer(PoseBuffer::new(&config.sync)),
+            PoseTopic::Tf => Self::Tree {
+                tree: source.statics(),
+                fixed: config.input.map_frame.clone(),
+                base: rig.base_frame.clone(),
+            },
+        }
+    }
+
     fn lookup(&self, stamp_ns: i64) -> PoseLookup {
         match self {
             Self::Buffer(poses) => poses.lookup(stamp_ns),

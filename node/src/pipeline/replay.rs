@@ -14,7 +14,6 @@ use tracing::{info, warn};
 
 use crate::config::Config;
 use crate::engine::{Engine, ModelSource, UNTRAINED};
-use crate::poses::PoseBuffer;
 use crate::source::bag::BagSource;
 use crate::source::topics::PoseTopic;
 use crate::source::{Event, Rig};
@@ -152,14 +151,7 @@ fn step_all(
     to_sink: &Sender<SinkInput>,
 ) -> Result<(Front, Finished)> {
     let config = &options.config;
-    let store = match source.plan().pose {
-        PoseTopic::Message(_) => PoseStore::Buffer(PoseBuffer::new(&config.sync)),
-        PoseTopic::Tf => PoseStore::Tree {
-            tree: source.statics(),
-            fixed: config.input.map_frame.clone(),
-            base: rig.base_frame.clone(),
-        },
-    };
+    let store = PoseStore::of_bag(source, rig, config);
     let mut front = Front::new(config, rig, store);
     let mut maker = StepMaker::new(engine, rig.intrinsics(), config, Some(&options.out.join(MAP_FOLDER)))?;
     let mut saver = Saver { every_sec: config.map.save_every_sec, last: Instant::now(), failed: 0 };

@@ -57,6 +57,18 @@ fn stats(ms: &[f32]) -> StageStats {
     StageStats { p50: rank(0.5), p99: rank(0.99) }
 }
 
+/// Time all threads of this process have run, milliseconds, without what other programs took; `None` where the system
+/// does not say.
+pub fn cpu_ms() -> Option<f64> {
+    let mut sum = 0.0;
+    for task in std::fs::read_dir("/proc/self/task").ok()? {
+        // A thread that has just ended has no file any more.
+        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).unwrap_or_default();
+        sum += text.split_whitespace().next().and_then(|ns| ns.parse::<f64>().ok()).unwrap_or(0.0);
+    }
+    Some(sum * 1e-6)
+}
+
 /// Starts the count of [`peak_rss_mb`] anew, where the system can.
 pub fn reset_peak_rss() {
     // Not being able to (other systems, locked-down containers) only means that the peak covers more than was asked.
@@ -65,8 +77,17 @@ pub fn reset_peak_rss() {
 
 /// Largest resident memory of this process so far, MB; `None` where the system does not say.
 pub fn peak_rss_mb() -> Option<f64> {
+    status_mb("VmHWM:")
+}
+
+/// Resident memory of this process, MB; `None` where the system does not say.
+pub fn rss_mb() -> Option<f64> {
+    status_mb("VmRSS:")
+}
+
+fn status_mb(key: &str) -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
+    let line = status.lines().find(|l| l.starts_with(key))?;
     let kb: f64 = line.split_whitespace().nth(1)?.parse().ok()?;
     Some(kb / 1024.0)
 }

@@ -1,14 +1,12 @@
 //! Long drives without a network: the map and the trajectories fed with the procedural drive's truth, and measured
 //! against it. What falls short here is the map's or the trackers' fault alone.
 
-mod machine;
 mod map_quality;
 mod object_quality;
 mod oracle;
 mod run;
 mod track_quality;
 
-pub use machine::{cpu_ms, rss_mb};
 pub use map_quality::MapFigures;
 pub use object_quality::ObjectFigures;
 pub use oracle::{OracleErrors, OracleSet, OracleStep, OracleWindow};

@@ -15,9 +15,9 @@ use crate::config::Config;
 use crate::engine::select;
 use crate::map::{MapCounts, SceneLook, StaticMap};
 use crate::objects::{ObjectCounts, ObjectTracker};
+use crate::pipeline::timing::{cpu_ms, rss_mb};
 use crate::tracks::{TrackCounts, Tracker};
 
-use super::machine::{cpu_ms, rss_mb};
 use super::map_quality::{MapFigures, MapJudge, ever_moving};
 use super::object_quality::{ObjectFigures, ObjectJudge};
 use super::oracle::{OracleErrors, OracleSet, OracleStep, OracleWindow};

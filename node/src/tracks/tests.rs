@@ -185,11 +185,11 @@ fn rate() {
         let points: Vec<_> = (0..80)
             .flat_map(|c| vehicle(DVec3::new(0.0, 4.0 * f64::from(c), 0.0) + v * 0.1 * step as f64, v, step))
             .collect();
-        let (start, cpu_start) = (std::time::Instant::now(), crate::soak::cpu_ms().unwrap_or(0.0));
+        let (start, cpu_start) = (std::time::Instant::now(), crate::pipeline::timing::cpu_ms().unwrap_or(0.0));
         t.step(step * 100 * MS, 0, &points);
         if step > 5 {
             wall.push(start.elapsed().as_secs_f64() * 1e3);
-            cpu.push(crate::soak::cpu_ms().unwrap_or(0.0) - cpu_start);
+            cpu.push(crate::pipeline::timing::cpu_ms().unwrap_or(0.0) - cpu_start);
         }
     }
     wall.sort_by(f64::total_cmp);

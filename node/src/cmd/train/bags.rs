@@ -16,10 +16,9 @@ use crate::config::Config;
 use crate::engine::truth::sample;
 use crate::pipeline::front::{Front, FrontOutput, TruthImage};
 use crate::pipeline::posed::PoseStore;
-use crate::poses::PoseBuffer;
 use crate::source::bag::BagSource;
 use crate::source::event::Truth;
-use crate::source::topics::{PoseTopic, TruthKind};
+use crate::source::topics::TruthKind;
 use crate::source::{Frame, Rig};
 use crate::sync::clock::seconds_between;
 use crate::window::{PosedSet, camera_from_flu, relative};
@@ -239,14 +238,7 @@ impl ClipSource for BagClips {
 
 /// Runs the bag through the stages in front of the network.
 fn read(source: &BagSource, rig: &Arc<Rig>, config: &Config, cameras: usize, size: (usize, usize)) -> Result<Read> {
-    let store = match source.plan().pose {
-        PoseTopic::Message(_) => PoseStore::Buffer(PoseBuffer::new(&config.sync)),
-        PoseTopic::Tf => PoseStore::Tree {
-            tree: source.statics(),
-            fixed: config.input.map_frame.clone(),
-            base: rig.base_frame.clone(),
-        },
-    };
+    let store = PoseStore::of_bag(source, rig, config);
     let mut front = Front::new(config, rig, store);
     let (mut read, mut ready) = (Read::default(), VecDeque::new());
     let set_bytes = cameras * size.0 * size.1 * 3;

@@ -12,7 +12,7 @@ pub const PAPER_RATE: f64 = 4e-4;
 #[derive(Debug, Clone, clap::Args)]
 pub struct RecipeArgs {
     /// Where the choices below come from when they are not given. small: what learns most on a small budget (one camera first,
-    /// from the truth of every pixel; then all cameras, pictures drawn as well), the one the weights that ship were made by;
+    /// from the truth of every pixel; then all cameras, pictures drawn as well), in one run what the weights that ship got in several;
     /// paper: rendering losses alone, AdamW at 4e-4.
     #[arg(long, default_value = "small", value_parser = ["small", "paper"])]
     recipe: String,

@@ -13,9 +13,8 @@ use crate::config::{Config, WindowConfig};
 use crate::engine::truth::TruthAt;
 use crate::pipeline::front::{Front, FrontOutput, TruthImage};
 use crate::pipeline::posed::PoseStore;
-use crate::poses::PoseBuffer;
 use crate::source::bag::BagSource;
-use crate::source::topics::{PoseTopic, TruthKind};
+use crate::source::topics::TruthKind;
 use crate::source::{Frame, Rig};
 use crate::sync::clock::signed_ns;
 use crate::window::{PosedSet, Window};
@@ -133,14 +132,7 @@ fn span(window: &Window<Frame>) -> Option<Span> {
 /// The bag through decode, sync and poses; `each` returns false to stop early.
 fn run_front(source: &BagSource, config: &Config, mut each: impl FnMut(FrontOutput) -> Result<bool>) -> Result<()> {
     let rig = source.rig();
-    let store = match source.plan().pose {
-        PoseTopic::Message(_) => PoseStore::Buffer(PoseBuffer::new(&config.sync)),
-        PoseTopic::Tf => PoseStore::Tree {
-            tree: source.statics(),
-            fixed: config.input.map_frame.clone(),
-            base: rig.base_frame.clone(),
-        },
-    };
+    let store = PoseStore::of_bag(source, &rig, config);
     let mut front = Front::new(config, &rig, store);
     let mut ready = VecDeque::new();
     let mut ended: Result<bool> = Ok(true);
