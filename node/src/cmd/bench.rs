@@ -51,16 +51,16 @@ pub struct Args {
 
 /// One network at one setting.
 #[derive(Debug, Serialize)]
-struct Setting {
+pub(super) struct Setting {
     model: String,
     weights: String,
     dtype: &'static str,
     skips: Vec<String>,
     skipped: u64,
-    tokens: usize,
+    pub(super) tokens: usize,
     gaussians: usize,
     picture: [usize; 2],
-    step_ms: StageStats,
+    pub(super) step_ms: StageStats,
     stages_ms: std::collections::BTreeMap<String, StageStats>,
     peak_rss_mb: Option<f64>,
     psnr: Option<f64>,
@@ -82,7 +82,8 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     bar.inc(1);
     let mut settings = Vec::new();
     for model in &models {
-        let setting = time_model(model, args.runs)?;
+        let section = ModelConfigSection { preset: model.clone(), ..ModelConfigSection::default() };
+        let setting = time_network(model, &section, args.runs)?;
         println!(
             "{:6} {:>6} tokens {:>7} Gaussians: step p50 {:>9.1} ms, p99 {:>9.1} ms, network {:>9.1} ms, three views {:>7.1} ms, peak {:.0} MB",
             setting.model,
@@ -141,17 +142,17 @@ fn time_world() -> Result<(f64, serde_json::Value)> {
     Ok((fps, json!({"images_per_sec": fps, "picture": [240, 160], "images": WORLD_IMAGES})))
 }
 
-fn time_model(name: &str, runs: usize) -> Result<Setting> {
-    let section = ModelConfigSection { preset: name.into(), ..ModelConfigSection::default() };
+/// Step times of the network that a configuration names, on a drive of its own size.
+pub(super) fn time_network(name: &str, section: &ModelConfigSection, runs: usize) -> Result<Setting> {
     let config = Config::default();
-    let source = ModelSource::open(&section)?;
-    let (width, height) = source.picture_size(&section)?;
+    let source = ModelSource::open(section)?;
+    let (width, height) = source.picture_size(section)?;
     let options = DriveOptions { seed: BENCH_SEED, seconds: 2.0, cameras: 3, width, height, ..DriveOptions::default() };
     let drive = Drive::new(&options).map_err(|e| UsageError(e.to_string()))?;
     let window = first_window(&drive, &config.window, 1).context("the drive gave no window")?;
     let cameras: Vec<Intrinsics> = drive.cameras().iter().map(|c| c.intrinsics).collect();
     reset_peak_rss();
-    let mut engine = Engine::new(source, &section, cameras.len(), config.window.timespan_sec)?;
+    let mut engine = Engine::new(source, section, cameras.len(), config.window.timespan_sec)?;
     let network = engine.model_config().clone();
     let grid = (height / network.patch_size) * (width / network.patch_size);
     let tokens = grid * cameras.len() * config.window.timesteps + network.auxiliary_tokens();

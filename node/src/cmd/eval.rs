@@ -86,13 +86,11 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let size = source.picture_size(&config.model)?;
     let data = Data::open(args, &config, size)?;
     let cameras = data.cameras();
-    check_cameras(&source, cameras)?;
     let timespan_sec = config.window.timespan_sec;
     let engine = Engine::new(source, &config.model, cameras, timespan_sec)?;
     let per_frame = args.per_frame_weights.as_deref().map(|path| {
         let section = ModelConfigSection { weights: path.display().to_string(), ..config.model.clone() };
         let source = ModelSource::open(&section)?;
-        check_cameras(&source, cameras)?;
         if source.picture_size(&section)? != size {
             let text = format!("--per-frame-weights {} are not for {}x{} pixels", path.display(), size.0, size.1);
             return Err(UsageError(text).into());
@@ -154,15 +152,6 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
 
 fn write(path: &Path, text: &str) -> Result<()> {
     std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
-}
-
-fn check_cameras(source: &ModelSource, cameras: usize) -> Result<()> {
-    let most = source.config().num_cams;
-    let untrained = matches!(source, ModelSource::Untrained { .. });
-    if untrained || most >= cameras || !source.config().use_affine_token {
-        return Ok(());
-    }
-    Err(UsageError(format!("these weights are for at most {most} cameras; there are {cameras}")).into())
 }
 
 /// Where clips come from.

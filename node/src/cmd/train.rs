@@ -1,9 +1,9 @@
 //! `storm train`: makes weights from procedural drives and recordings.
 
-mod ablations;
 mod bags;
 mod curves;
 mod cuts;
+mod grid;
 mod recipe;
 mod recordings;
 mod variants;
@@ -15,15 +15,16 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use candle_core::Device;
 use storm_model::train::{ClipOptions, Loader, TrainError, TrainOptions, Trainer, provenance, validate};
-use storm_model::weights::{self, SavedType, save_safetensors, untrained};
+use storm_model::weights::{self, SavedType, save_safetensors};
 use storm_model::{ModelConfig, Storm};
 use tracing::info;
 
 use super::{Outcome, UsageError, interrupt, progress_bar};
 use curves::Curves;
+use grid::GridName;
 use recipe::{PAPER_RATE, RecipeArgs, Start};
 use recordings::{RecordingArgs, Recordings};
-use variants::VariantArgs;
+use variants::{Beginning, VariantArgs};
 
 /// Target times drawn for validation.
 const VALIDATION_TARGETS: usize = 2;
@@ -40,9 +41,10 @@ pub struct Args {
     variant: VariantArgs,
     #[command(flatten)]
     recipe: RecipeArgs,
-    /// Train the grid of the paper's ablations, --steps each, and write table and picture to --out.
-    #[arg(long, conflicts_with_all = ["weights", "resume", "per_frame"])]
-    ablations: bool,
+    /// Train a whole grid of networks, --steps each, and write table and picture to --out: the paper's ablations, or sizes
+    /// and choices around the preset with their step times. Finished networks are kept, so a grid may be made in pieces.
+    #[arg(long, conflicts_with_all = ["resume", "per_frame", "motion_tokens", "timesteps", "no_sky_token", "no_affine_token"])]
+    grid: Option<GridName>,
     /// Save and end at this step of the run; --resume goes on there.
     #[arg(long)]
     stop_at: Option<u64>,
@@ -113,8 +115,8 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     // SAFETY: the command line has been read and the log started; no other thread runs yet.
     unsafe { storm_model::ops::set_up_training() };
     let device = device(&args.device)?;
-    if args.ablations {
-        return ablations::run(args, &device, progress);
+    if let Some(name) = args.grid {
+        return grid::run(args, name, &device, progress);
     }
     let mut trainer = start(args, &device)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make folder {}", args.out.display()))?;
@@ -201,24 +203,12 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
     if let Some(path) = &args.resume {
         return Ok(Trainer::resume(path, device)?);
     }
-    let (config, tensors, history) = match &args.weights {
-        Some(path) if path.as_os_str() == SHIPPED => {
-            let (config, tensors) = weights::shipped(&Device::Cpu)?;
-            (config, tensors, weights::shipped_provenance())
-        }
-        Some(path) => {
-            let (config, tensors) = weights::load(path, None, &Device::Cpu)
-                .with_context(|| format!("cannot use weights {}", path.display()))?;
-            let history = provenance(path).unwrap_or_else(|| "weights of unknown origin".into());
-            (config, tensors, history)
-        }
+    let Beginning { config, weights, history } = match &args.weights {
+        Some(path) => args.variant.change(trained(path)?, args.seed)?,
         None => {
             let config = ModelConfig::preset(&args.preset).map_err(|e| UsageError(e.to_string()))?;
             let config = ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config };
-            let config = args.variant.configure(config);
-            let mut tensors = untrained(&config, args.seed, &Device::Cpu)?;
-            args.variant.settle(&mut tensors)?;
-            (config, tensors, format!("untrained {}, seed {}", args.preset, args.seed))
+            args.variant.make(&config, args.seed, &args.preset)?
         }
     };
     let mut options = TrainOptions::new(args.seed, args.steps, args.batch, PAPER_RATE);
@@ -255,7 +245,19 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
     args.variant.apply(&mut options);
     args.recorded.apply(&mut options)?;
     options.check().map_err(|e| UsageError(e.to_string()))?;
-    Ok(Trainer::new(&config, &tensors, options, device)?)
+    Ok(Trainer::new(&config, &weights, options, device)?)
+}
+
+/// The network of a weights file, or the one that ships.
+fn trained(path: &std::path::Path) -> Result<Beginning> {
+    if path.as_os_str() == SHIPPED {
+        let (config, weights) = weights::shipped(&Device::Cpu)?;
+        return Ok(Beginning { config, weights, history: weights::shipped_provenance() });
+    }
+    let (config, weights) =
+        weights::load(path, None, &Device::Cpu).with_context(|| format!("cannot use weights {}", path.display()))?;
+    let history = provenance(path).unwrap_or_else(|| "weights of unknown origin".into());
+    Ok(Beginning { config, weights, history })
 }
 
 /// Weights (their moving average), the checkpoint, and what happened before it.

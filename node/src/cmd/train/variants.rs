@@ -1,8 +1,15 @@
 //! Networks with parts left out: the settings of the paper's ablations and of its per-frame baseline.
 
+use std::collections::BTreeSet;
+
+use anyhow::Result;
+use candle_core::Device;
+use serde_json::Value;
 use storm_model::ModelConfig;
 use storm_model::train::TrainOptions;
-use storm_model::weights::Tensors;
+use storm_model::weights::{Tensors, untrained};
+
+use crate::cmd::UsageError;
 
 /// A velocity scale at which whatever the decoder says stands still: nanometres per second.
 const STILL_MPS: f64 = 1e-9;
@@ -10,31 +17,43 @@ const STILL_MPS: f64 = 1e-9;
 /// Target pictures of the per-frame setting lie within one stride: a frame stands for itself until the next one.
 const PER_FRAME_TIMESTEPS: usize = 1;
 
-/// What a new network has.
+/// What makes a network other than the one it starts from.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct VariantArgs {
-    /// Motion tokens of a new network; 0: velocities straight from the pixels' features.
-    #[arg(long, conflicts_with_all = ["weights", "resume"])]
+    /// Change a key of the network's configuration, as `--network depth=6 --network color=absolute`; may be given again.
+    /// Keys and values are those in a weight file's header. With --weights, tensors whose shape changes start anew.
+    #[arg(long, value_name = "KEY=VALUE", conflicts_with = "resume")]
+    pub network: Vec<String>,
+    /// Motion tokens; 0: velocities straight from the pixels' features.
+    #[arg(long, conflicts_with = "resume")]
     pub motion_tokens: Option<usize>,
     /// Context timesteps of the training clips, 1 to 10 [default: 4].
     #[arg(long, conflicts_with = "resume")]
     pub timesteps: Option<usize>,
-    /// A new network without sky token and sky head.
-    #[arg(long, conflicts_with_all = ["weights", "resume"])]
+    /// Without sky token and sky head.
+    #[arg(long, conflicts_with = "resume")]
     pub no_sky_token: bool,
-    /// A new network without affine tokens: no exposure per camera.
-    #[arg(long, conflicts_with_all = ["weights", "resume"])]
+    /// Without affine tokens: no exposure per camera.
+    #[arg(long, conflicts_with = "resume")]
     pub no_affine_token: bool,
     /// Each timestep alone and nothing moves (the GS-LRM setting): one timestep, no motion tokens, velocity 0, targets
     /// within a stride.
-    #[arg(long, conflicts_with_all = ["weights", "resume", "motion_tokens", "timesteps"])]
+    #[arg(long, conflicts_with_all = ["resume", "motion_tokens", "timesteps"])]
     pub per_frame: bool,
+}
+
+/// A network to start training from.
+pub struct Beginning {
+    pub config: ModelConfig,
+    pub weights: Tensors,
+    /// What happened to it so far.
+    pub history: String,
 }
 
 impl VariantArgs {
     /// The network's side.
-    pub fn configure(&self, config: ModelConfig) -> ModelConfig {
-        let mut config = config;
+    fn configure(&self, config: &ModelConfig) -> Result<ModelConfig> {
+        let mut config = set_keys(config, &self.network)?;
         if let Some(m) = self.motion_tokens {
             config.num_motion_tokens = m;
         }
@@ -48,11 +67,44 @@ impl VariantArgs {
             config.num_motion_tokens = 0;
             config.velocity_scale = STILL_MPS;
         }
-        config
+        config.validate().map_err(|e| UsageError(e.to_string()))?;
+        Ok(config)
     }
 
-    /// The first weights' side: untrained velocities are made for their scale, so at a scale of nothing they are set to 0.
-    pub fn settle(&self, weights: &mut Tensors) -> candle_core::Result<()> {
+    /// A new network.
+    pub fn make(&self, config: &ModelConfig, seed: u64, name: &str) -> Result<Beginning> {
+        let config = self.configure(config)?;
+        let mut weights = untrained(&config, seed, &Device::Cpu)?;
+        self.settle(&mut weights)?;
+        Ok(Beginning { config, weights, history: format!("untrained {name}, seed {seed}") })
+    }
+
+    /// A trained network, changed: what keeps its name and shape keeps its values, the rest starts anew.
+    pub fn change(&self, from: Beginning, seed: u64) -> Result<Beginning> {
+        let config = self.configure(&from.config)?;
+        if config == from.config {
+            return Ok(from);
+        }
+        let mut weights = untrained(&config, seed, &Device::Cpu)?;
+        let mut anew = BTreeSet::new();
+        for (name, x) in &mut weights {
+            match from.weights.get(name).filter(|old| old.dims() == x.dims()) {
+                Some(old) => *x = old.clone(),
+                None => {
+                    anew.insert(name.split('.').next().unwrap_or(name).to_owned());
+                }
+            }
+        }
+        self.settle(&mut weights)?;
+        let parts = anew.into_iter().collect::<Vec<_>>().join(", ");
+        let anew = if parts.is_empty() { "nothing".to_owned() } else { parts };
+        let history =
+            format!("{}; changed to {}, where {anew} began anew (seed {seed})", from.history, config.describe());
+        Ok(Beginning { config, weights, history })
+    }
+
+    /// Untrained velocities are made for their scale, so at a scale of nothing they are set to 0.
+    fn settle(&self, weights: &mut Tensors) -> Result<()> {
         let last = |name: &str| name.starts_with("motion_basis_decoder") && name.contains(".fc2.");
         for (_, x) in weights.iter_mut().filter(|(name, _)| self.per_frame && last(name)) {
             *x = x.zeros_like()?;
@@ -73,11 +125,27 @@ impl VariantArgs {
     }
 }
 
+/// A configuration with some of its keys set from `KEY=VALUE` texts, values in YAML.
+fn set_keys(config: &ModelConfig, changes: &[String]) -> Result<ModelConfig> {
+    let mut all = serde_json::to_value(config)?;
+    for change in changes {
+        let wrong = |why: String| UsageError(format!("--network {change}: {why}"));
+        let (key, value) = change.split_once('=').ok_or_else(|| wrong("expected KEY=VALUE".into()))?;
+        let value: Value = serde_yaml::from_str(value).map_err(|e| wrong(e.to_string()))?;
+        let Some(place) = all.get_mut(key) else {
+            let keys: Vec<&str> = all.as_object().into_iter().flatten().map(|(k, _)| k.as_str()).collect();
+            return Err(wrong(format!("there is no such key; there are {}", keys.join(", "))).into());
+        };
+        *place = value;
+        // One by one, so that the message is about this key.
+        serde_json::from_value::<ModelConfig>(all.clone()).map_err(|e| wrong(e.to_string()))?;
+    }
+    Ok(serde_json::from_value(all)?)
+}
+
 #[cfg(test)]
 mod tests {
-    use candle_core::Device;
     use storm_model::train::{Stage, Trainer};
-    use storm_model::weights::untrained;
 
     use super::*;
 
@@ -111,15 +179,12 @@ mod tests {
             with(&|v| v.per_frame = true),
         ];
         for variant in variants {
-            let config = variant.configure(tiny.clone());
-            config.validate().unwrap();
+            let Beginning { config, weights, .. } = variant.make(&tiny, 1, "small").unwrap();
             let mut options = TrainOptions::new(1, 10, 1, 1e-3);
             options.stage = Stage::Both;
             (options.clips.width, options.clips.height, options.clips.targets) = (24, 16, 1);
             variant.apply(&mut options);
             let timesteps = options.clips.timesteps;
-            let mut weights = untrained(&config, 1, &Device::Cpu).unwrap();
-            variant.settle(&mut weights).unwrap();
             let mut trainer = Trainer::new(&config, &weights, options, &Device::Cpu).unwrap();
             let clip = trainer.data().batch(0, &config).unwrap();
             assert_eq!(clip.context.image.dims()[1], timesteps);
@@ -133,5 +198,45 @@ mod tests {
             assert_eq!(output.sky_token.is_some(), !variant.no_sky_token);
             assert_eq!(output.affine.is_some(), !variant.no_affine_token);
         }
+    }
+
+    #[test]
+    fn keys_of_the_network_are_set_by_name_and_wrong_ones_say_which_there_are() {
+        let base = ModelConfig::preset("tiny").unwrap();
+        let with = |changes: &[&str]| set_keys(&base, &changes.iter().map(|c| c.to_string()).collect::<Vec<_>>());
+        assert_eq!(with(&[]).unwrap(), base);
+        let deep = with(&["depth=6", "color=absolute"]).unwrap();
+        assert_eq!((deep.depth, deep.color), (6, storm_model::config::ColorBase::Absolute));
+        for (change, says) in [
+            ("layers=6", "embed_dim"),
+            ("depth", "KEY=VALUE"),
+            ("depth=deep", "invalid type"),
+            ("color=pink", "absolute"),
+            ("depth=[", "depth=["),
+        ] {
+            let error = with(&[change]).unwrap_err().to_string();
+            assert!(error.contains(says), "{change}: {error}");
+        }
+        let wrong = VariantArgs { network: vec!["num_heads=5".into()], ..VariantArgs::default() };
+        assert!(wrong.make(&base, 1, "tiny").is_err());
+    }
+
+    #[test]
+    fn a_changed_network_keeps_what_still_fits() {
+        let (config, weights) = storm_model::weights::shipped(&Device::Cpu).unwrap();
+        let from = || Beginning { config: config.clone(), weights: weights.clone(), history: "shipped".into() };
+        let same = VariantArgs::default().change(from(), 1).unwrap();
+        assert_eq!((same.config, same.history.as_str()), (config.clone(), "shipped"));
+        let fewer = VariantArgs { motion_tokens: Some(4), ..VariantArgs::default() };
+        let fewer = fewer.change(from(), 1).unwrap();
+        let values = |w: &Tensors, name: &str| w[name].flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let mut kept = 0;
+        for name in fewer.weights.keys() {
+            let fits = weights.get(name).is_some_and(|x| x.dims() == fewer.weights[name].dims());
+            assert_eq!(fits && values(&weights, name) == values(&fewer.weights, name), fits, "{name}");
+            kept += usize::from(fits);
+        }
+        assert!(kept > 40 && kept < fewer.weights.len(), "{kept} of {}", fewer.weights.len());
+        assert!(fewer.history.contains("motion_token"), "{}", fewer.history);
     }
 }
