@@ -1,6 +1,6 @@
 //! What the network sees: a window of posed pictures.
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 use glam::Affine3A;
 use storm_render::Intrinsics;
 
@@ -92,6 +92,17 @@ impl ClipBatch {
             world_from_camera: Tensor::from_vec(poses, (1, t, v, 4, 4), device)?,
             time_sec: Tensor::from_vec(times, (1, t, v), device)?,
             timespan_sec,
+        })
+    }
+
+    /// The same windows in another type, f64 for a reference of what f32 loses.
+    pub fn to_dtype(&self, dtype: DType) -> Result<Self, ModelError> {
+        Ok(Self {
+            image: self.image.to_dtype(dtype)?,
+            intrinsics: self.intrinsics.to_dtype(dtype)?,
+            world_from_camera: self.world_from_camera.to_dtype(dtype)?,
+            time_sec: self.time_sec.to_dtype(dtype)?,
+            timespan_sec: self.timespan_sec,
         })
     }
 

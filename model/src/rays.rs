@@ -1,6 +1,6 @@
 //! Camera rays: the part of the input that carries 3D (paper section 3.1, "Network and input").
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor, WithDType};
 
 use crate::clip::ClipBatch;
 use crate::config::{DepthMeaning, ModelConfig, RayPixelOffset};
@@ -62,22 +62,29 @@ fn host(tensor: &Tensor) -> Result<Vec<f64>, ModelError> {
 }
 
 impl Rays {
-    /// Rays of a batch in f64 on the host, rounded once to f32.
+    /// Rays of a batch in f64 on the host, rounded once to the type of its pictures.
     pub fn new(config: &ModelConfig, batch: &ClipBatch) -> Result<Self, ModelError> {
+        match batch.image.dtype() {
+            DType::F64 => Self::rounded::<f64>(config, batch),
+            _ => Self::rounded::<f32>(config, batch),
+        }
+    }
+
+    fn rounded<T: WithDType>(config: &ModelConfig, batch: &ClipBatch) -> Result<Self, ModelError> {
         let [b, t, v, h, w] = batch.dims()?;
         let (ks, poses) = (host(&batch.intrinsics)?, host(&batch.world_from_camera)?);
         check_cameras(&ks, &poses, t, v)?;
         let (views, pixels) = (b * t * v, h * w);
-        let mut origins = vec![0f32; views * 3];
-        let mut directions = vec![0f32; views * pixels * 3];
-        let mut plucker = vec![0f32; views * pixels * 6];
+        let mut origins = vec![T::zero(); views * 3];
+        let mut directions = vec![T::zero(); views * pixels * 3];
+        let mut plucker = vec![T::zero(); views * pixels * 6];
         let offset = pixel_offset(config);
         for view in 0..views {
             let (k, m) = (&ks[9 * view..9 * view + 9], &poses[16 * view..16 * view + 16]);
             let rotation = [0, 1, 2].map(|i| [m[4 * i], m[4 * i + 1], m[4 * i + 2]]);
             let camera = RayCamera::new([k[0], k[4], k[2], k[5]], rotation, offset);
             let o = [m[3], m[7], m[11]];
-            (0..3).for_each(|i| origins[3 * view + i] = o[i] as f32);
+            (0..3).for_each(|i| origins[3 * view + i] = T::from_f64(o[i]));
             let out = &mut directions[view * pixels * 3..(view + 1) * pixels * 3];
             let planes = &mut plucker[view * pixels * 6..(view + 1) * pixels * 6];
             for pixel in 0..pixels {
@@ -89,17 +96,17 @@ impl Rays {
                 };
                 let moment = [o[1] * u[2] - o[2] * u[1], o[2] * u[0] - o[0] * u[2], o[0] * u[1] - o[1] * u[0]];
                 for i in 0..3 {
-                    out[3 * pixel + i] = along[i] as f32;
-                    planes[i * pixels + pixel] = (config.ray_moment_scale * moment[i]) as f32;
-                    planes[(3 + i) * pixels + pixel] = u[i] as f32;
+                    out[3 * pixel + i] = T::from_f64(along[i]);
+                    planes[i * pixels + pixel] = T::from_f64(config.ray_moment_scale * moment[i]);
+                    planes[(3 + i) * pixels + pixel] = T::from_f64(u[i]);
                 }
             }
         }
-        let device: &Device = batch.image.device();
+        let (device, dtype): (&Device, DType) = (batch.image.device(), batch.image.dtype());
         Ok(Self {
-            origins: Tensor::from_vec(origins, (b, t, v, 1, 1, 3), device)?,
-            directions: Tensor::from_vec(directions, (b, t, v, h, w, 3), device)?,
-            plucker: Tensor::from_vec(plucker, (views, 6, h, w), device)?,
+            origins: Tensor::from_vec(origins, (b, t, v, 1, 1, 3), device)?.to_dtype(dtype)?,
+            directions: Tensor::from_vec(directions, (b, t, v, h, w, 3), device)?.to_dtype(dtype)?,
+            plucker: Tensor::from_vec(plucker, (views, 6, h, w), device)?.to_dtype(dtype)?,
         })
     }
 }

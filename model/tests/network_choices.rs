@@ -1,7 +1,7 @@
 //! The network under every choice, window shape and bad input, on a small untrained network.
 #![allow(clippy::unwrap_used)]
 
-use candle_core::{Device, Tensor, Var};
+use candle_core::{DType, Device, Tensor, Var};
 use glam::{Affine3A, Quat, Vec3};
 use storm_model::config::{
     AffineKind, ColorBase, DepthActivation, DepthMeaning, MaskDecoder, RayPixelOffset, SkyKind, VelocityKind,
@@ -322,4 +322,36 @@ fn gradients_reach_every_trained_tensor_and_weights_are_followed() {
     conv.set(&(conv.as_tensor() * 2.0).unwrap()).unwrap();
     let after = storm.forward_stages(&clip, &mut Stages::only(&["motion_keys"])).unwrap();
     assert!(worst(&values(&after.velocity_forward), &values(&output.velocity_forward)) > 0.0);
+}
+
+/// Largest difference over 1 + the magnitude.
+fn apart(a: &Tensor, b: &Tensor) -> f64 {
+    let wide = |x: &Tensor| x.to_dtype(DType::F64).unwrap().flatten_all().unwrap().to_vec1::<f64>().unwrap();
+    wide(a).iter().zip(wide(b)).map(|(a, b)| (a - b).abs() / (1.0 + b.abs())).fold(0.0, f64::max)
+}
+
+#[test]
+fn f64_says_what_f32_says_and_more_exactly() {
+    let paper = small().with_paper_choices();
+    for config in [small(), ModelConfig { color: ColorBase::Residual, ..paper.clone() }, paper] {
+        let tensors = untrained(&config, 3, &Device::Cpu).unwrap();
+        // Another picture size than the embedding's, so that its resampling is compared too.
+        let batch = clip(2, 2, 16, 12);
+        let near = Storm::new(&config, &tensors).unwrap().forward(&batch).unwrap();
+        let wide = Storm::in_f64(&config, &tensors).unwrap();
+        let exact = wide.forward(&batch.to_dtype(DType::F64).unwrap()).unwrap();
+        assert_eq!(exact.means.dtype(), DType::F64);
+        for (a, b) in [
+            (&near.means, &exact.means),
+            (&near.colors, &exact.colors),
+            (&near.velocity_forward, &exact.velocity_forward),
+            (&near.opacities, &exact.opacities),
+        ] {
+            let error = apart(a, b);
+            assert!(error > 0.0 && error < 1e-4, "{error}");
+        }
+        let (a, b) = (near.scene(0).unwrap(), exact.scene(0).unwrap());
+        assert_eq!(a.shape, b.shape);
+        assert_eq!(a.sky.is_some(), b.sky.is_some());
+    }
 }

@@ -1,6 +1,6 @@
 //! Pictures, rays and times to image tokens (paper section 3.1, "Network and input").
 
-use candle_core::{DType, Tensor};
+use candle_core::{DType, Device, Tensor};
 
 use super::params::{Arranged, Params};
 use super::resample::resample;
@@ -83,11 +83,12 @@ impl Embed {
                 let frequency = (-TIME_PERIODS.ln() * k as f64 / half as f64).exp();
                 time / batch.timespan_sec * frequency
             });
-            waves.extend(angles.clone().map(|a| a.cos() as f32));
-            waves.extend(angles.map(|a| a.sin() as f32));
+            waves.extend(angles.clone().map(f64::cos));
+            waves.extend(angles.map(f64::sin));
         }
         let frequency_shape = [&shape[..], &[TIME_CHANNELS]].concat();
-        let waves = Tensor::from_vec(waves, frequency_shape, batch.time_sec.device())?;
+        let waves = Tensor::from_vec(waves, frequency_shape, &Device::Cpu)?.to_dtype(batch.image.dtype())?;
+        let waves = waves.to_device(batch.image.device())?;
         stages.keep("time_freq", &waves);
         let x = linear(&waves, &self.time[0], Activation::Silu, None)?;
         let x = linear(&x, &self.time[1], Activation::None, None)?;

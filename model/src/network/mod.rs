@@ -14,7 +14,7 @@ mod upsample;
 use std::path::Path;
 use std::sync::Arc;
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 pub use output::ClipOutput;
 pub(crate) use params::NORM_EPS;
 use params::Params;
@@ -43,7 +43,7 @@ pub struct Storm {
 }
 
 impl Storm {
-    /// The network over given tensors (all on one device, f32), named as [`weights::tensor_specs`] lists them.
+    /// The network over given tensors (all on one device and of one type), named as [`weights::tensor_specs`] lists them.
     ///
     /// Tensors that are variables stay variables: to train, pass each variable's tensor.
     ///
@@ -88,6 +88,12 @@ impl Storm {
     /// An untrained network; the same seed gives the same network everywhere.
     pub fn untrained(config: &ModelConfig, seed: u64, device: &Device) -> Result<Self, ModelError> {
         Self::new(config, &weights::untrained(config, seed, device)?)
+    }
+
+    /// The same network computing in f64, without kernels: slow, and the reference of what f32 loses.
+    pub fn in_f64(config: &ModelConfig, tensors: &Tensors) -> Result<Self, ModelError> {
+        let wide = tensors.iter().map(|(name, x)| Ok((name.clone(), x.to_dtype(DType::F64)?)));
+        Self::new(config, &wide.collect::<Result<Tensors, ModelError>>()?)
     }
 
     /// The configuration, `max_scale` as the weights have it.

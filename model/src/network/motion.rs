@@ -1,6 +1,6 @@
 //! Motion tokens and mask decoder: velocities as a soft mixture of a few bases (paper section 3.1).
 
-use candle_core::{D, Device, Tensor};
+use candle_core::{D, Tensor};
 
 use super::params::{Mlp, Params};
 use super::stages::Stages;
@@ -64,14 +64,15 @@ fn product(x: &Tensor, rows: Tensor) -> candle_core::Result<Tensor> {
 }
 
 /// The velocities that spread bases start from, `(M, 3 | 6)`.
-fn fan(config: &ModelConfig, device: &Device) -> candle_core::Result<Tensor> {
+fn fan(config: &ModelConfig, like: &Tensor) -> candle_core::Result<Tensor> {
     let row = |v: [f32; 3]| match config.velocity {
         VelocityKind::One => v.to_vec(),
         // `v-` is the velocity for earlier times with its sign turned (paper eq. 1).
         VelocityKind::ForwardBackward => [v.map(|x| -x), v].concat(),
     };
     let bases = spread_bases(config.num_motion_tokens).into_iter().flat_map(row).collect::<Vec<f32>>();
-    Tensor::from_vec(bases, (config.num_motion_tokens, config.velocity_channels()), device)
+    let shape = (config.num_motion_tokens, config.velocity_channels());
+    Tensor::from_vec(bases, shape, like.device())?.to_dtype(like.dtype())
 }
 
 impl MotionHead {
@@ -163,7 +164,7 @@ impl MotionHead {
         let bases = if config.velocity_scale == 1.0 { bases } else { (bases * config.velocity_scale)? };
         let bases = match config.velocity_bases {
             VelocityBases::Learned => bases,
-            VelocityBases::Spread => bases.broadcast_add(&fan(config, bases.device())?)?,
+            VelocityBases::Spread => bases.broadcast_add(&fan(config, &bases)?)?,
         };
         Ok((queries, bases))
     }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use candle_core::{D, Tensor};
+use candle_core::{D, DType, Tensor};
 use storm_render::Gaussians;
 
 use super::sky::SkyHead;
@@ -136,7 +136,7 @@ fn triple(x: &[f32]) -> [f32; 3] {
 
 /// All values of a tensor on the host, refused when one is not finite.
 fn plain(name: &str, x: &Tensor) -> Result<Vec<f32>, ModelError> {
-    let values = x.flatten_all()?.to_vec1::<f32>()?;
+    let values = x.flatten_all()?.to_dtype(DType::F32)?.to_vec1::<f32>()?;
     let count = values.iter().filter(|x| !x.is_finite()).count();
     if count > 0 {
         return Err(ModelError::NonFinite { tensor: name.to_owned(), count });

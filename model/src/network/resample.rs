@@ -17,11 +17,11 @@ fn cubic(x: f64) -> f64 {
 
 /// Row-major `(to, from)` weights of antialiased bicubic resampling with pixel centres at half integers
 /// (`align_corners = False`): the filter widens when shrinking, and each row sums to 1.
-fn weights(from: usize, to: usize) -> Vec<f32> {
+fn weights(from: usize, to: usize) -> Vec<f64> {
     let ratio = from as f64 / to as f64;
     let stretch = ratio.max(1.0);
     let support = 2.0 * stretch;
-    let mut out = vec![0f32; to * from];
+    let mut out = vec![0f64; to * from];
     for i in 0..to {
         let centre = ratio * (i as f64 + 0.5);
         let low = (centre - support + 0.5).max(0.0) as usize;
@@ -29,7 +29,7 @@ fn weights(from: usize, to: usize) -> Vec<f32> {
         let taps: Vec<f64> = (low..high).map(|j| cubic((j as f64 + 0.5 - centre) / stretch)).collect();
         let sum: f64 = taps.iter().sum();
         for (j, tap) in (low..high).zip(taps) {
-            out[i * from + j] = (tap / sum) as f32;
+            out[i * from + j] = tap / sum;
         }
     }
     out
@@ -41,9 +41,11 @@ pub(crate) fn resample(embedding: &Tensor, from: (usize, usize), to: (usize, usi
         return Ok(embedding.clone());
     }
     let d = embedding.dim(2)?;
-    let device: &Device = embedding.device();
-    let vertical = Tensor::from_vec(weights(from.0, to.0), (to.0, from.0), device)?;
-    let horizontal = Tensor::from_vec(weights(from.1, to.1), (to.1, from.1), device)?;
+    let matrix = |from: usize, to: usize| {
+        let weights = Tensor::from_vec(weights(from, to), (to, from), &Device::Cpu)?;
+        weights.to_dtype(embedding.dtype())?.to_device(embedding.device())
+    };
+    let (vertical, horizontal) = (matrix(from.0, to.0)?, matrix(from.1, to.1)?);
     let x = vertical.matmul(&embedding.reshape((from.0, from.1 * d))?)?;
     let x = x.reshape((to.0, from.1, d))?.transpose(0, 1)?.contiguous()?.reshape((from.1, to.0 * d))?;
     let x = horizontal.matmul(&x)?.reshape((to.1, to.0, d))?.transpose(0, 1)?;
@@ -58,7 +60,7 @@ mod tests {
     fn rows_sum_to_one_and_the_same_size_is_the_identity() {
         for (from, to) in [(3, 6), (5, 9), (9, 5), (20, 3), (1, 4), (4, 1)] {
             for row in weights(from, to).chunks(from) {
-                assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{from} -> {to}: {row:?}");
+                assert!((row.iter().sum::<f64>() - 1.0).abs() < 1e-6, "{from} -> {to}: {row:?}");
             }
         }
         let same = weights(4, 4);

@@ -13,7 +13,7 @@ mod torch;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 pub use check::check_shapes;
 pub use error::{Mismatch, WeightsError};
 pub use infer::infer_config;
@@ -159,7 +159,7 @@ fn unwrapped(name: &str) -> &str {
 /// The frozen `max_scale` of a set of weights, metres.
 pub(crate) fn frozen_max_scale(tensors: &Tensors) -> Result<f64, ModelError> {
     let tensor = tensors.get("max_scale").ok_or_else(|| WeightsError::missing("max_scale"))?;
-    let value = f64::from(tensor.flatten_all()?.get(0)?.to_scalar::<f32>()?);
+    let value = tensor.flatten_all()?.get(0)?.to_dtype(DType::F64)?.to_scalar::<f64>()?;
     if value.is_finite() && value > 0.0 {
         return Ok(value);
     }
