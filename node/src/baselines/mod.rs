@@ -2,7 +2,7 @@
 //! ground truth. Plain numbers in and out; `engine::evaluate` feeds and scores them.
 
 mod adam;
-mod dice;
+
 pub mod gs3d;
 pub mod nearest;
 pub mod nsfp;

@@ -10,6 +10,7 @@ mod map;
 mod render;
 mod replay;
 mod soak;
+mod stress;
 mod synth;
 mod train;
 
@@ -87,6 +88,8 @@ enum Command {
     Bench(bench::Args),
     /// Long procedural drives through the map and the trackers, without a network: times, memory, errors.
     Soak(soak::Args),
+    /// Put numbers at their limits through the engine and compare with f64: a table of what was tried and what came out.
+    Stress(stress::Args),
     /// Print every configuration key with its default and meaning, as a YAML file ready to edit.
     Config(config::Args),
 }
@@ -107,6 +110,7 @@ impl Cli {
             Command::Train(a) => train::run(&a, progress),
             Command::Bench(a) => bench::run(&a, progress),
             Command::Soak(a) => soak::run(&a, progress),
+            Command::Stress(a) => stress::run(&a, progress),
             Command::Config(a) => config::run(&a),
         };
         result.unwrap_or_else(|e| {

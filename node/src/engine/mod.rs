@@ -146,6 +146,11 @@ impl Engine {
 
     /// Runs the network on one window: Gaussians in the window's anchor frame, sky and exposure.
     pub fn step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
+        Ok(self.model.forward(&self.batch(window, cameras)?)?.scene(0)?)
+    }
+
+    /// One window as the network takes it.
+    pub fn batch(&self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<ClipBatch> {
         let pictures: Vec<Vec<Vec<f32>>> = window
             .steps
             .iter()
@@ -162,8 +167,7 @@ impl Engine {
                 (0..cameras.len().min(pictures[t].len())).map(view).collect()
             })
             .collect();
-        let batch = ClipBatch::from_views(&views, PixelLayout::Hwc, self.timespan_sec, &self.device)?;
-        Ok(self.model.forward(&batch)?.scene(0)?)
+        Ok(ClipBatch::from_views(&views, PixelLayout::Hwc, self.timespan_sec, &self.device)?)
     }
 
     /// Draws a scene: `targets` are camera index (for its exposure) and view in the anchor frame.

@@ -125,7 +125,7 @@ fn blur(plane: &[f32], width: usize, height: usize) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::baselines::dice::Dice;
+    use crate::dice::Dice;
 
     const W: usize = 14;
     const H: usize = 9;

@@ -17,7 +17,7 @@ use storm_render::raster::{CpuRasterizer, PictureGradient, RasterSettings, Splat
 pub use loss::Reference;
 pub use params::{Optimizer, Params, extent_m};
 
-use super::dice::Dice;
+use crate::dice::Dice;
 
 /// Iterations of the paper's per-scene baselines.
 pub const ITERATIONS: u64 = 5_000;

@@ -8,7 +8,7 @@ use storm_render::raster::SplatGradients;
 use storm_render::{Gaussians, View};
 
 use crate::baselines::adam::Adam;
-use crate::baselines::dice::Dice;
+use crate::dice::Dice;
 
 /// Random points lie this far from their camera, metres, evenly in the logarithm: what a street shows.
 const DEPTH_RANGE_M: [f32; 2] = [2.0, 200.0];

@@ -39,7 +39,7 @@ pub fn chamfer(moved: &[[f32; 3]], target: &Cloud, asked: &[[f32; 3]]) -> (f64, 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::baselines::dice::Dice;
+    use crate::dice::Dice;
 
     #[test]
     fn agrees_with_comparing_every_pair_and_the_gradient_is_the_slope() {

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::baselines::dice::Dice;
+use crate::dice::Dice;
 
 /// Width of the hidden layers.
 pub const WIDTH: usize = 64;

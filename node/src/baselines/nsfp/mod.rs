@@ -15,8 +15,8 @@ use chamfer::chamfer;
 use mlp::{LEN, Mlp};
 
 use super::adam::Adam;
-use super::dice::Dice;
 use super::nearest::Cloud;
+use crate::dice::Dice;
 
 /// Most points of a cloud that are moved.
 pub const POINTS: usize = 2048;
