@@ -12,6 +12,7 @@ pub mod decode;
 pub mod dice;
 pub mod engine;
 pub mod extrinsics;
+pub mod gate;
 pub mod map;
 pub mod msg;
 pub mod objects;

@@ -98,6 +98,32 @@ section! {
 }
 
 section! {
+    /// Skipping what a scene does not need.
+    pub struct SkipConfig {
+        /// A window that shows what the last computed one showed takes its result: all cameras where they were, all pictures the same up to noise.
+        still: bool = true,
+        /// A camera may be this far from where it was and still count as standing, metres.
+        still_m: f64 = 0.02,
+        /// And turned by this much, degrees.
+        still_deg: f64 = 0.05,
+        /// And its timesteps lie apart by this much more or less, seconds.
+        still_sec: f64 = 0.03,
+        /// A patch of 4x4 pixels has changed when its mean is off by more than this many standard deviations of the pictures' noise,
+        still_sigmas: f64 = 6.0,
+        /// and by more than this many 8-bit levels.
+        still_levels: f64 = 1.5,
+        /// After this many skipped steps one is computed all the same and compared; 0: nothing is skipped.
+        check_every: usize = 50,
+        /// Most PSNR a skipped step may lose against the computed one, dB; beyond it checks come twice as often, down to no skipping.
+        max_psnr_loss_db: f64 = 0.1,
+        /// Largest difference of velocities, as a part of the speeds seen.
+        max_flow_change: f64 = 0.02,
+        /// Largest part of the moving pixels in which the two differ.
+        max_mask_change: f64 = 0.01,
+    }
+}
+
+section! {
     /// The long-horizon map.
     pub struct MapConfig {
         /// Edge of the tiles the map is kept, put to disk and published in, metres.
@@ -213,6 +239,8 @@ pub struct Config {
     pub window: WindowConfig,
     /// The network.
     pub model: ModelConfigSection,
+    /// Skipping what a scene does not need.
+    pub skip: SkipConfig,
     /// The long-horizon map.
     pub map: MapConfig,
     /// Point trajectories.
@@ -231,6 +259,7 @@ impl Config {
         docs.extend(SyncConfig::describe("sync"));
         docs.extend(WindowConfig::describe("window"));
         docs.extend(ModelConfigSection::describe("model"));
+        docs.extend(SkipConfig::describe("skip"));
         docs.extend(MapConfig::describe("map"));
         docs.extend(TracksConfig::describe("tracks"));
         docs.extend(ObjectsConfig::describe("objects"));

@@ -19,6 +19,15 @@ impl Config {
         between("window.hop_sec", window.hop_sec, 0.0, 60.0)?;
         between("window.stride_tolerance", window.stride_tolerance, 0.0, 0.5)?;
         between("window.timespan_sec", window.timespan_sec, 1e-3, 600.0)?;
+        between("skip.still_m", self.skip.still_m, 0.0, 1.0)?;
+        between("skip.still_deg", self.skip.still_deg, 0.0, 10.0)?;
+        between("skip.still_sec", self.skip.still_sec, 0.0, 1.0)?;
+        between("skip.still_sigmas", self.skip.still_sigmas, 1.0, 100.0)?;
+        between("skip.still_levels", self.skip.still_levels, 0.0, 255.0)?;
+        count("skip.check_every", self.skip.check_every, 0, 1_000_000)?;
+        between("skip.max_psnr_loss_db", self.skip.max_psnr_loss_db, 0.0, 100.0)?;
+        between("skip.max_flow_change", self.skip.max_flow_change, 0.0, 100.0)?;
+        between("skip.max_mask_change", self.skip.max_mask_change, 0.0, 1.0)?;
         between("map.tile_m", self.map.tile_m, 1.0, 1000.0)?;
         // A tile's voxels are numbered with so many bits.
         let finest = self.map.tile_m / f64::from(crate::map::MAX_PER_EDGE);

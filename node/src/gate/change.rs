@@ -1,0 +1,168 @@
+//! Whether two pictures of one camera show the same, up to the camera's noise.
+//!
+//! The question is asked of the worst place, not of the mean: a pedestrian who steps out far away changes a handful of pixels. Every
+//! 4x4 patch (they overlap by half) and every single pixel is compared with what the noise of these two pictures allows.
+
+use crate::decode::RgbPicture;
+
+/// Side of a patch, pixels; patches start at every second pixel.
+const PATCH: usize = 4;
+const STRIDE: usize = 2;
+/// A Gaussian's standard deviation over the median of its absolute values.
+const SIGMA_OVER_MAD: f32 = 1.4826;
+/// Least noise assumed of the difference of two 8-bit pictures: that of rounding both.
+const LEAST_SIGMA: f32 = 0.41;
+/// More noise than this is not believed: what looks like it is change everywhere (rain, a shaking mount).
+const MOST_SIGMA: f32 = 8.0;
+/// A pixel alone has to stand out so much more than a patch: there are many, and compression makes them jump.
+const PIXEL_SIGMAS_FACTOR: f32 = 1.5;
+const PIXEL_LEVELS_FACTOR: f32 = 5.0;
+
+/// What counts as change.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sensitivity {
+    /// Standard deviations of the noise of a patch's mean.
+    pub sigmas: f32,
+    /// And at least so many 8-bit levels.
+    pub levels: f32,
+}
+
+/// A place where two pictures differ.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Change {
+    /// Column and row of the patch's or pixel's corner.
+    pub at: [usize; 2],
+    /// How much, 8-bit levels, mean over the patch.
+    pub levels: f32,
+}
+
+/// The first place where `b` differs from `a` by more than noise; none where they show the same. Pictures of different sizes
+/// differ everywhere.
+pub fn first_change(a: &RgbPicture, b: &RgbPicture, sensitivity: Sensitivity) -> Option<Change> {
+    let (w, h) = (a.width, a.height);
+    let whole = |p: &RgbPicture| p.width == w && p.height == h && p.data.len() == 3 * w * h;
+    if !whole(a) || !whole(b) {
+        return Some(Change { at: [0, 0], levels: 255.0 });
+    }
+    if a.data == b.data {
+        return None;
+    }
+    // Sum over the channels: what moves mostly changes all three alike, and noise grows more slowly than that.
+    let d: Vec<i16> = a
+        .data
+        .chunks_exact(3)
+        .zip(b.data.chunks_exact(3))
+        .map(|(a, b)| (0..3).map(|c| i16::from(b[c]) - i16::from(a[c])).sum())
+        .collect();
+    let sigma = noise(&d, w).clamp(LEAST_SIGMA * 3f32.sqrt(), MOST_SIGMA * 3f32.sqrt());
+    let pixel_limit =
+        (PIXEL_SIGMAS_FACTOR * sensitivity.sigmas * sigma).max(PIXEL_LEVELS_FACTOR * 3.0 * sensitivity.levels);
+    if let Some(i) = d.iter().position(|&x| f32::from(x).abs() > pixel_limit) {
+        return Some(Change { at: [i % w, i / w], levels: f32::from(d[i]) / 3.0 });
+    }
+    let pixels = (PATCH * PATCH) as f32;
+    let limit = (sensitivity.sigmas * sigma / pixels.sqrt()).max(3.0 * sensitivity.levels);
+    let starts = |size: usize| (0..=size.saturating_sub(PATCH)).step_by(STRIDE);
+    for y in starts(h) {
+        for x in starts(w) {
+            let rows = (y..(y + PATCH).min(h)).map(|row| &d[row * w + x..row * w + (x + PATCH).min(w)]);
+            let (sum, count) = rows
+                .fold((0i32, 0), |(sum, n), row| (sum + row.iter().map(|&x| i32::from(x)).sum::<i32>(), n + row.len()));
+            let mean = sum as f32 / count.max(1) as f32;
+            if mean.abs() > limit {
+                return Some(Change { at: [x, y], levels: mean / 3.0 });
+            }
+        }
+    }
+    None
+}
+
+/// Standard deviation of the noise in a picture of differences. From neighbours' differences, so that a change of exposure,
+/// which is the same everywhere, is not taken for noise; from their median, so that a mover is not either.
+fn noise(d: &[i16], width: usize) -> f32 {
+    let mut steps: Vec<u16> =
+        d.chunks_exact(width.max(1)).flat_map(|row| row.windows(2).map(|p| p[0].abs_diff(p[1]))).collect();
+    if steps.is_empty() {
+        return 0.0;
+    }
+    let middle = steps.len() / 2;
+    let (_, median, _) = steps.select_nth_unstable(middle);
+    SIGMA_OVER_MAD * f32::from(*median) / std::f32::consts::SQRT_2
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dice::Dice;
+
+    const NORMAL: Sensitivity = Sensitivity { sigmas: 6.0, levels: 1.5 };
+
+    /// A street-like picture with noise of this standard deviation (sum of uniforms).
+    fn picture(seed: u64, sigma: f32) -> RgbPicture {
+        let (width, height) = (96, 64);
+        let mut dice = Dice::new(seed);
+        let data = (0..3 * width * height).map(|i| {
+            let (x, y, c) = (i / 3 % width, i / 3 / width, i % 3);
+            let base = 90.0 + 60.0 * ((x as f32 * 0.2).sin() * (y as f32 * 0.15).cos()) + 10.0 * c as f32;
+            let noise = (0..12).map(|_| dice.unit()).sum::<f32>() - 6.0;
+            (base + sigma * noise).round().clamp(0.0, 255.0) as u8
+        });
+        RgbPicture { width, height, data: data.collect() }
+    }
+
+    fn changed(mut p: RgbPicture, side: usize, levels: i16) -> RgbPicture {
+        for y in 30..30 + side {
+            for x in 50..50 + side {
+                for c in 0..3 {
+                    let v = &mut p.data[3 * (y * 96 + x) + c];
+                    *v = (i16::from(*v) + levels).clamp(0, 255) as u8;
+                }
+            }
+        }
+        p
+    }
+
+    #[test]
+    fn noise_alone_is_no_change() {
+        for (k, sigma) in [0.0, 0.5, 1.0, 2.0, 4.0].into_iter().enumerate() {
+            for seed in 0..40 {
+                let (a, b) = (picture(1000 * k as u64 + seed, sigma), picture(1000 * k as u64 + seed + 500, sigma));
+                assert_eq!(first_change(&a, &b, NORMAL), None, "sigma {sigma}, seed {seed}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_small_far_mover_is_a_change_whatever_the_noise() {
+        for sigma in [0.0, 1.0, 2.0] {
+            for (side, levels) in [(2, 40), (3, 25), (4, -15), (8, 8)] {
+                for seed in 0..10 {
+                    let (a, b) = (picture(seed, sigma), changed(picture(seed + 500, sigma), side, levels));
+                    let change = first_change(&a, &b, NORMAL);
+                    let change = change.unwrap_or_else(|| panic!("{side} pixels by {levels} in noise {sigma}"));
+                    assert!(change.at[0].abs_diff(50) <= 8 && change.at[1].abs_diff(30) <= 8, "{change:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn exposure_and_other_sizes_are_changes() {
+        let a = picture(1, 2.0);
+        let mut b = picture(2, 2.0);
+        b.data.iter_mut().for_each(|x| *x = x.saturating_add(4));
+        assert!(first_change(&a, &b, NORMAL).is_some());
+        let smaller = RgbPicture { width: 48, height: 64, data: vec![0; 48 * 64 * 3] };
+        assert!(first_change(&a, &smaller, NORMAL).is_some());
+        let broken = RgbPicture { width: 96, height: 64, data: vec![0; 7] };
+        assert!(first_change(&a, &broken, NORMAL).is_some());
+        assert_eq!(first_change(&broken, &broken, NORMAL).map(|c| c.at), Some([0, 0]));
+    }
+
+    #[test]
+    fn pictures_smaller_than_a_patch_are_compared_too() {
+        let one = |x| RgbPicture { width: 2, height: 1, data: vec![x; 6] };
+        assert_eq!(first_change(&one(10), &one(11), NORMAL), None);
+        assert!(first_change(&one(10), &one(40), NORMAL).is_some());
+    }
+}
