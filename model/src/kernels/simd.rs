@@ -32,6 +32,8 @@ pub(crate) trait Simd: Copy + 'static {
     fn select_lt(a: Self::V, b: Self::V, x: Self::V, y: Self::V) -> Self::V;
     /// `2^n` for `t = 1.5 * 2^23 + n`, `-126 <= n <= 127`, by shifting `n` into the exponent.
     fn exponent(t: Self::V) -> Self::V;
+    /// `p 2^n` for `t = 1.5 * 2^23 + n`, by adding `n` to the exponent: `p` and the result must be normal numbers.
+    fn scale(p: Self::V, t: Self::V) -> Self::V;
 
     fn zero() -> Self::V {
         Self::splat(0.0)
@@ -137,6 +139,10 @@ impl<const W: usize, const FMA: bool> Simd for Lanes<W, FMA> {
     fn exponent(t: Self::V) -> Self::V {
         lanewise!(W, |i| f32::from_bits(t[i].to_bits().wrapping_add(127) << 23))
     }
+    #[inline(always)]
+    fn scale(p: Self::V, t: Self::V) -> Self::V {
+        lanewise!(W, |i| f32::from_bits(p[i].to_bits().wrapping_add(t[i].to_bits() << 23)))
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -214,6 +220,14 @@ mod avx2 {
             unsafe {
                 let n = _mm256_add_epi32(_mm256_castps_si256(t), _mm256_set1_epi32(127));
                 _mm256_castsi256_ps(_mm256_slli_epi32::<23>(n))
+            }
+        }
+        #[inline(always)]
+        fn scale(p: __m256, t: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe {
+                let n = _mm256_slli_epi32::<23>(_mm256_castps_si256(t));
+                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), n))
             }
         }
     }
