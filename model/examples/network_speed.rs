@@ -100,7 +100,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     let parts = products(&config);
     let flop = 2.0 * parts.iter().map(|(_, x)| x).sum::<f64>();
     let threads = rayon::current_num_threads();
-    println!("{preset}: {:.2} GFLOP; {:?}, {threads} threads, peak {:.1} GFLOP/s a thread", flop / 1e9, Isa::detect(), peak / 1e9);
+    println!(
+        "{preset}: {:.2} GFLOP; {:?}, {threads} threads, peak {:.1} GFLOP/s a thread",
+        flop / 1e9,
+        Isa::detect(),
+        peak / 1e9
+    );
     for (name, products) in parts {
         println!("  {name:24} {:7.3} GFLOP, {:8.2} ms of a thread at peak", 2e-9 * products, 2e3 * products / peak);
     }

@@ -1,6 +1,7 @@
 //! Camera rays: the part of the input that carries 3D (paper section 3.1, "Network and input").
 
 use candle_core::{Device, Tensor};
+use rayon::prelude::*;
 
 use crate::clip::ClipBatch;
 use crate::config::{DepthMeaning, ModelConfig, RayPixelOffset};
@@ -73,13 +74,16 @@ impl Rays {
         let mut plucker = vec![0f32; views * pixels * 6];
         let offset = pixel_offset(config);
         for view in 0..views {
+            let m = &poses[16 * view..16 * view + 16];
+            [m[3], m[7], m[11]].iter().enumerate().for_each(|(i, &o)| origins[3 * view + i] = o as f32);
+        }
+        // Pictures without pixels have no rays.
+        let each = directions.par_chunks_mut(3 * pixels.max(1)).zip(plucker.par_chunks_mut(6 * pixels.max(1)));
+        each.enumerate().for_each(|(view, (out, planes))| {
             let (k, m) = (&ks[9 * view..9 * view + 9], &poses[16 * view..16 * view + 16]);
             let rotation = [0, 1, 2].map(|i| [m[4 * i], m[4 * i + 1], m[4 * i + 2]]);
             let camera = RayCamera::new([k[0], k[4], k[2], k[5]], rotation, offset);
             let o = [m[3], m[7], m[11]];
-            (0..3).for_each(|i| origins[3 * view + i] = o[i] as f32);
-            let out = &mut directions[view * pixels * 3..(view + 1) * pixels * 3];
-            let planes = &mut plucker[view * pixels * 6..(view + 1) * pixels * 6];
             for pixel in 0..pixels {
                 let d = camera.direction(pixel / w, pixel % w);
                 let u = unit(d);
@@ -94,7 +98,7 @@ impl Rays {
                     planes[(3 + i) * pixels + pixel] = u[i] as f32;
                 }
             }
-        }
+        });
         let device: &Device = batch.image.device();
         Ok(Self {
             origins: Tensor::from_vec(origins, (b, t, v, 1, 1, 3), device)?,

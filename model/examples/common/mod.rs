@@ -1,4 +1,5 @@
 //! What several examples measure with.
+#![allow(dead_code)] // Each example uses a part of it.
 
 /// Seconds all threads of this process have run (Linux), which other programs on the machine do not inflate.
 pub fn cpu_seconds() -> Option<f64> {

@@ -109,8 +109,7 @@ impl Kernel for Task<'_> {
         let mut largest = [0f32; BLOCK_QUERIES];
         let mut total = [0f32; BLOCK_QUERIES];
         let mut shrink = [0f32; BLOCK_QUERIES];
-        let flat = query * self.sizes.key <= FLAT_LOGITS * FLAT_LOGITS
-            && self.sizes.value <= FLAT_VALUES * FLAT_VALUES;
+        let flat = query * self.sizes.key <= FLAT_LOGITS * FLAT_LOGITS && self.sizes.value <= FLAT_VALUES * FLAT_VALUES;
         let totals = totals.at_least(BLOCK_QUERIES * S::W);
         match flat {
             true => totals.fill(0.0),
@@ -341,8 +340,10 @@ fn run(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32], log_sums: Option<Ou
         *sizes = pack(qkv, &shape, &layout, index, block);
     });
     let packed = &*packed;
-    let sizes: Vec<Sizes> =
-        sizes.chunks_exact(layout.blocks).map(|head| head.iter().copied().reduce(Sizes::or).unwrap_or_default()).collect();
+    let sizes: Vec<Sizes> = sizes
+        .chunks_exact(layout.blocks)
+        .map(|head| head.iter().copied().reduce(Sizes::or).unwrap_or_default())
+        .collect();
     let query_blocks = shape.tokens.div_ceil(BLOCK_QUERIES);
     let output = Output { start: out.as_mut_ptr(), len: out.len() };
     (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {

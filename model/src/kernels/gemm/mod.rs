@@ -58,7 +58,7 @@ struct Scratch {
 }
 
 #[derive(Default)]
-struct BlockScratch {
+pub(super) struct BlockScratch {
     packed: Aligned,
     partial: Aligned,
 }
@@ -149,7 +149,14 @@ impl Kernel for Block<'_> {
                         if last && width == nr {
                             let bias = bias.map(|b| &b[col..col + nr]);
                             let residual = residual.map(|x| &x[i * MR * n..]);
-                            finish_tile::<S, MR>(&acc, (rows, n, col), bias, act, residual, &mut self.out[i * MR * n..]);
+                            finish_tile::<S, MR>(
+                                &acc,
+                                (rows, n, col),
+                                bias,
+                                act,
+                                residual,
+                                &mut self.out[i * MR * n..],
+                            );
                             continue;
                         }
                         for r in 0..MR {
@@ -189,7 +196,7 @@ fn check(x: &[f32], w: &PackedWeight, epilogue: &Epilogue<'_>, m: usize, out: us
 }
 
 /// Rows of a task: few enough that every thread gets several, at most a block.
-fn task_rows(isa: Isa, m: usize) -> usize {
+pub(super) fn task_rows(isa: Isa, m: usize) -> usize {
     m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(isa.tile_rows()).min(BLOCK_ROWS)
 }
 
@@ -218,6 +225,15 @@ pub fn linear(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, out: &mut [f3
             dispatch(w.isa, Block { scratch: &mut scratch.blocks, x: Rows::Lying(x), w, epilogue, out });
         });
     });
+}
+
+/// [`linear`] on this thread alone, any number of rows at once.
+pub(super) fn block(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, scratch: &mut BlockScratch, out: &mut [f32]) {
+    if w.n == 0 || out.is_empty() {
+        return;
+    }
+    check(x, w, &epilogue, out.len() / w.n, out.len());
+    dispatch(w.isa, Block { scratch, x: Rows::Lying(x), w, epilogue, out });
 }
 
 /// Two layers, `out = linear(linear(x, first), second)`, block of rows by block of rows: what lies between them, several
