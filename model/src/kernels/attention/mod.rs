@@ -425,6 +425,34 @@ mod tests {
     }
 
     #[test]
+    fn either_way_to_the_weights_in_used_memory() {
+        let s = Shape { batch: 1, tokens: 301, heads: 2, head_dim: 20 };
+        let row = 3 * s.width();
+        for isa in Isa::tested() {
+            // Each head's queries times this: lengths bound the logits of neither, one or both heads.
+            for (i, scales) in [[0.5, 0.5], [0.5, 30.0], [30.0, 30.0]].into_iter().enumerate() {
+                let mut qkv = noise(40 + i as u64, s.tokens * row, 1.0);
+                for (j, x) in qkv.iter_mut().enumerate().filter(|(j, _)| j % row < s.width()) {
+                    *x *= scales[j % row / s.head_dim];
+                }
+                let mut out = vec![f32::NAN; s.tokens * s.width()];
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+                pool.install(|| {
+                    PACKED.with_borrow_mut(|memory| memory.at_least(1 << 17).fill(f32::NAN));
+                    SCRATCH.with_borrow_mut(|Scratch { queries, weights, sums, totals }| {
+                        for memory in [queries, weights, sums, totals] {
+                            memory.at_least(1 << 16).fill(f32::NAN);
+                        }
+                    });
+                    attention(isa, &qkv, s, &mut out);
+                });
+                let worst = worst_difference(&out, &reference(&qkv, s));
+                assert!(worst < 10.0 * TOLERANCE, "{isa:?} {scales:?}: {worst:e}");
+            }
+        }
+    }
+
+    #[test]
     fn logits_of_ten_thousand_stay_finite() {
         let s = Shape { batch: 1, tokens: 300, heads: 2, head_dim: 16 };
         let mut qkv = noise(5, s.tokens * 3 * s.width(), 1.0);

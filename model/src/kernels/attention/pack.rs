@@ -124,20 +124,26 @@ pub(super) struct Source<'a> {
 }
 
 impl Source<'_> {
-    /// Row panels of `MR` queries, scaled; rows past the end are zeros. Returns the square of the longest scaled query.
+    /// Row panels of `MR` queries, scaled; the last query again past the end. Returns the square of the longest scaled query.
     #[inline(always)]
     pub(super) fn pack_queries<const MR: usize>(&self, packed: &mut [f32], queries: usize) -> f32 {
         let (d, width) = (self.shape.head_dim, self.shape.width());
         let scale = std::f32::consts::LOG2_E / (d as f32).sqrt();
-        packed[queries / MR * d * MR..].fill(0.0);
+        let start = (self.batch * self.shape.tokens + self.first) * 3 * width + self.head * d;
         let mut longest = 0f32;
-        for r in 0..queries {
-            let row = (self.batch * self.shape.tokens + self.first + r) * 3 * width + self.head * d;
-            let panel = &mut packed[r / MR * d * MR..][..d * MR];
-            for (c, &x) in self.qkv[row..row + d].iter().enumerate() {
-                panel[c * MR + r % MR] = x * scale;
+        let panels = packed.chunks_exact_mut(d * MR).take(queries.div_ceil(MR));
+        for (i, panel) in panels.enumerate() {
+            // All rows at a time: they lie far apart, and their misses overlap.
+            let rows: [&[f32]; MR] =
+                std::array::from_fn(|r| &self.qkv[start + (i * MR + r).min(queries - 1) * 3 * width..][..d]);
+            for (c, column) in panel.chunks_exact_mut(MR).enumerate() {
+                for r in 0..MR {
+                    column[r] = rows[r][c] * scale;
+                }
             }
-            longest = larger(longest, squares(&self.qkv[row..row + d]));
+            for row in rows {
+                longest = larger(longest, squares(row));
+            }
         }
         longest * scale * scale
     }

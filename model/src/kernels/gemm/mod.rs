@@ -19,7 +19,7 @@ use rayon::prelude::*;
 
 use super::Isa;
 use super::aligned::Aligned;
-use super::simd::{Kernel, Simd, dispatch};
+use super::simd::{Kernel, Simd, dispatch, prefetch};
 use crate::ops::Activation;
 use pack::{Depths, pack_columns, pack_rows};
 use tile::{finish, finish_tile};
@@ -32,6 +32,8 @@ pub(crate) use tile::tile;
 const BLOCK_ROWS: usize = 96;
 /// Columns of partial sums kept at a time (`96 x 512` floats are 192 KiB).
 const BLOCK_COLS: usize = 512;
+/// Floats of a cache line.
+const LINE_FLOATS: usize = 16;
 /// Depth up to which whole row panels are read where they lie: packing would cost as much as a good part of the products.
 const DIRECT_DEPTH: usize = 64;
 /// Tasks per thread that keep threads busy to the end.
@@ -125,12 +127,19 @@ impl Kernel for Block<'_> {
                 let last = at + depth == k;
                 for j in 0..panels {
                     let b = &weights[((first_panel + j) * k + at) * nr..][..depth * nr];
+                    // The next panel is fetched while this one is used: each tile asks for a part of it.
+                    let ahead = if j + 1 < panels { &weights[((first_panel + j + 1) * k + at) * nr..] } else { &[] };
+                    let ahead = &ahead[..ahead.len().min(depth * nr)];
+                    let part = (depth * nr).div_ceil(row_panels).next_multiple_of(LINE_FLOATS);
                     let col = (first_panel + j) * nr;
                     let width = nr.min(n - col);
                     for i in 0..row_panels {
                         let a = &packed[(i * k + at) * MR..][..depth * MR];
                         let sums = &mut partial[(j % partial_panels * row_panels + i) * MR * nr..][..MR * nr];
                         let mut acc = [[S::zero(); 2]; MR];
+                        for line in ahead.iter().skip(i * part).take(part).step_by(LINE_FLOATS) {
+                            prefetch(line);
+                        }
                         // SAFETY: `sums` has MR rows of two vectors; `a` has `depth * MR`, `b` `depth * 2 W` floats.
                         unsafe {
                             if at > 0 {
