@@ -6,7 +6,7 @@
 //! tiles (in units of log 2, so that the softmax is a power of two), turns them into weights row by row, and adds the
 //! weighted values to its output block. All blocks of a task fit the second-level cache.
 //!
-//! Where the lengths of a task's queries and of its head's keys bound every logit by [`FLAT_LOGITS`], nothing is subtracted: the
+//! Where the lengths of a task's queries and of its head's keys bound every logit by `FLAT_LOGITS`, nothing is subtracted: the
 //! softmax does not depend on it and no power can overflow or vanish, so weights are taken as the logits leave the registers.
 //! Else logits may be of any finite size: the largest so far is subtracted before the power is taken, so weights are at most
 //! 1 and the sum at least 1. A NaN in a query, key or value reaches every output that depends on it.
