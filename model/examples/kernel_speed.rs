@@ -8,18 +8,16 @@ mod common;
 use std::time::Instant;
 
 use candle_core::{Device, Result, Tensor};
-use storm_model::kernels::{Isa, peak};
+use storm_model::kernels::Isa;
 use storm_model::ops::{self, Activation, Linear};
 use storm_model::plain;
 
-use common::cpu_seconds;
+use common::{cpu_seconds, fma_peak};
 
 /// Timed runs of each case, after one that is not.
 const RUNS: usize = 3;
-/// Multiply-add steps of the peak loop: about 10 ms.
-const PEAK_STEPS: usize = 5_000_000;
-/// Its runs, of which the best counts.
-const PEAK_RUNS: usize = 20;
+/// Runs of the peak loop, of which the best counts.
+const PEAK_RUNS: usize = 10;
 
 /// Seconds of one run.
 #[derive(Clone, Copy)]
@@ -53,25 +51,13 @@ fn report(name: &str, flop: f64, seconds: Seconds, peak: f64) {
     println!("{name:36} best {}, median {}{cpu}", rate(seconds.best), rate(seconds.median));
 }
 
-/// The peak by processor time where there is one.
-fn peak() -> Result<f64> {
-    let threads = rayon::current_num_threads();
-    let mut best = 0f64;
-    for _ in 0..PEAK_RUNS {
-        let cpu = cpu_seconds();
-        let (flop, seconds) = peak::fma(Isa::detect(), PEAK_STEPS);
-        let busy = cpu.zip(cpu_seconds()).map_or(seconds, |(before, after)| (after - before) / threads as f64);
-        best = best.max(flop / busy);
-    }
-    Ok(best)
-}
-
 fn main() -> Result<()> {
     let only = std::env::args().nth(1);
     let wanted = |name: &str| only.as_deref().is_none_or(|o| o == name);
     let cpu = Device::Cpu;
-    let peak = peak()?;
-    println!("{:?}, {} threads: {:.1} GFLOP/s peak", Isa::detect(), rayon::current_num_threads(), peak / 1e9);
+    let threads = rayon::current_num_threads();
+    let peak = threads as f64 * (0..PEAK_RUNS).map(|_| fma_peak()).fold(0.0, f64::max);
+    println!("{:?}, {} threads: {:.1} GFLOP/s peak", Isa::detect(), threads, peak / 1e9);
 
     if wanted("attention") {
         for (n, heads, d) in [(7220, 12, 64), (1152, 6, 32), (384, 6, 32)] {

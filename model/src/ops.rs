@@ -9,6 +9,8 @@
 //! them at every use and keeps what a backward pass would need: detach them once (`Tensor::detach`) when the model is
 //! loaded for inference alone.
 
+mod arrange;
+mod chain;
 mod graph;
 mod process;
 mod training;
@@ -22,7 +24,9 @@ use crate::kernels::tensors::{covered, tracked, with_optional, with_values};
 use crate::kernels::{self, Isa};
 use crate::plain;
 
-pub use process::set_up_training;
+pub(crate) use arrange::{gaussians, patches, unnest};
+pub use chain::{Step, chain};
+pub use process::{keep_freed_memory, set_up_training};
 
 /// A linear layer: weight `(out, in)` as PyTorch stores it, optional bias `(out)`.
 ///
@@ -36,7 +40,7 @@ pub struct Linear {
     pub weight: Tensor,
     /// `(out)`.
     pub bias: Option<Tensor>,
-    packed: Arc<OnceLock<(TensorId, PackedWeight)>>,
+    packed: Arc<OnceLock<(TensorId, Arc<PackedWeight>)>>,
 }
 
 impl Linear {
@@ -49,19 +53,20 @@ impl Linear {
     /// the kernels do not cover.
     pub fn prepare(&self) -> Result<()> {
         match covered([&self.weight]) && !self.weight.track_op() {
-            true => self.with_packed(|_| Ok(())),
+            true => self.packed().map(drop),
             false => Ok(()),
         }
     }
 
-    fn pack(&self) -> Result<PackedWeight> {
+    fn pack(&self) -> Result<Arc<PackedWeight>> {
         let (n, k) = self.weight.dims2()?;
-        with_values(&self.weight, |values| Ok(PackedWeight::new(Isa::detect(), values, n, k)))
+        with_values(&self.weight, |values| Ok(Arc::new(PackedWeight::new(Isa::detect(), values, n, k))))
     }
 
-    fn with_packed<R>(&self, f: impl FnOnce(&PackedWeight) -> Result<R>) -> Result<R> {
+    /// The kernel's layout of the weight as it is now.
+    fn packed(&self) -> Result<Arc<PackedWeight>> {
         if self.weight.track_op() {
-            return f(&self.pack()?);
+            return self.pack();
         }
         let id = self.weight.id();
         if self.packed.get().is_none() {
@@ -69,13 +74,13 @@ impl Linear {
             let _ = self.packed.set((id, self.pack()?));
         }
         match self.packed.get() {
-            Some((packed_id, packed)) if *packed_id == id => f(packed),
-            _ => f(&self.pack()?),
+            Some((packed_id, packed)) if *packed_id == id => Ok(Arc::clone(packed)),
+            _ => self.pack(),
         }
     }
 
     fn with_parts<R>(&self, f: impl FnOnce(&PackedWeight, Option<&[f32]>) -> Result<R>) -> Result<R> {
-        with_optional(self.bias.as_ref(), |bias| self.with_packed(|packed| f(packed, bias)))
+        with_optional(self.bias.as_ref(), |bias| f(&*self.packed()?, bias))
     }
 
     /// Whether weight and bias fit each other and an input of these dimensions.

@@ -1,6 +1,5 @@
 //! Camera rays: the part of the input that carries 3D (paper section 3.1, "Network and input").
 
-use candle_core::{DType, Device, Tensor, WithDType};
 
 use crate::clip::ClipBatch;
 use crate::config::{DepthMeaning, ModelConfig, RayPixelOffset};
@@ -80,13 +79,18 @@ impl Rays {
         let mut plucker = vec![T::zero(); views * pixels * 6];
         let offset = pixel_offset(config);
         for view in 0..views {
+            let m = &poses[16 * view..16 * view + 16];
+            [m[3], m[7], m[11]].iter().enumerate().for_each(|(i, &o)| origins[3 * view + i] = T::from_f64(o));
+        }
+        // Pictures without pixels have no rays.
+        let each = directions.par_chunks_mut(3 * pixels.max(1)).zip(plucker.par_chunks_mut(6 * pixels.max(1)));
+        each.enumerate().for_each(|(view, (out, planes))| {
             let (k, m) = (&ks[9 * view..9 * view + 9], &poses[16 * view..16 * view + 16]);
             let rotation = [0, 1, 2].map(|i| [m[4 * i], m[4 * i + 1], m[4 * i + 2]]);
             let camera = RayCamera::new([k[0], k[4], k[2], k[5]], rotation, offset);
             let o = [m[3], m[7], m[11]];
-            (0..3).for_each(|i| origins[3 * view + i] = T::from_f64(o[i]));
-            let out = &mut directions[view * pixels * 3..(view + 1) * pixels * 3];
-            let planes = &mut plucker[view * pixels * 6..(view + 1) * pixels * 6];
+        });
+        let (device, dtype): (&Device, DType) = (batch.image.device(), batch.image.dtype());
             for pixel in 0..pixels {
                 let d = camera.direction(pixel / w, pixel % w);
                 let u = unit(d);
@@ -101,8 +105,13 @@ impl Rays {
                     planes[(3 + i) * pixels + pixel] = T::from_f64(u[i]);
                 }
             }
+<<<<<<< HEAD
         }
         let (device, dtype): (&Device, DType) = (batch.image.device(), batch.image.dtype());
+=======
+        });
+        let device: &Device = batch.image.device();
+>>>>>>> 0f248b2f864a48f38ae438ad7b18ad1d942e820b
         Ok(Self {
             origins: Tensor::from_vec(origins, (b, t, v, 1, 1, 3), device)?.to_dtype(dtype)?,
             directions: Tensor::from_vec(directions, (b, t, v, h, w, 3), device)?.to_dtype(dtype)?,

@@ -11,7 +11,10 @@
 //! Backward passes take what the forward pass kept; [`crate::ops`] puts both into candle's gradient graph.
 
 mod aligned;
+pub mod arrange;
 pub mod attention;
+pub mod chain;
+pub mod gaussians;
 pub mod gemm;
 pub mod math;
 pub mod norm;

@@ -27,6 +27,20 @@ impl Kernel for Softmax<'_> {
             let top = x.iter().fold(f32::MIN, |a, &b| if b > a { b } else { a });
             let top_vector = S::splat(top);
             let mut total = 0f32;
+            if self.width.is_multiple_of(S::W) {
+                let mut sum = S::zero();
+                for (x, out) in x.chunks_exact(S::W).zip(out.chunks_exact_mut(S::W)) {
+                    // SAFETY: both chunks have one vector.
+                    unsafe {
+                        let v = exp2::<S>(S::mul(S::sub(S::load(x.as_ptr()), top_vector), scale));
+                        S::store(out.as_mut_ptr(), v);
+                        sum = S::add(sum, v);
+                    }
+                }
+                let inverse = 1.0 / S::sum(sum);
+                out.iter_mut().for_each(|o| *o *= inverse);
+                continue;
+            }
             for (x, out) in x.chunks(S::W).zip(out.chunks_mut(S::W)) {
                 let mut lanes = [f32::MIN; 16];
                 lanes[..x.len()].copy_from_slice(x);
@@ -57,6 +71,11 @@ pub fn softmax(isa: Isa, x: &[f32], width: usize, tau: f32, out: &mut [f32]) {
     out.par_chunks_mut(task).zip(x.par_chunks(task)).for_each(|(out, x)| {
         dispatch(isa, Softmax { x, width, scale, out });
     });
+}
+
+/// [`softmax`] on this thread alone, for lengths that were checked.
+pub(super) fn softmax_rows(isa: Isa, x: &[f32], width: usize, tau: f32, out: &mut [f32]) {
+    dispatch(isa, Softmax { x, width, scale: std::f32::consts::LOG2_E / tau, out });
 }
 
 /// `out = act(x) + residual`, element by element.

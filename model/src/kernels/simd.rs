@@ -32,6 +32,8 @@ pub(crate) trait Simd: Copy + 'static {
     fn select_lt(a: Self::V, b: Self::V, x: Self::V, y: Self::V) -> Self::V;
     /// `2^n` for `t = 1.5 * 2^23 + n`, `-126 <= n <= 127`, by shifting `n` into the exponent.
     fn exponent(t: Self::V) -> Self::V;
+    /// `p 2^n` for `t = 1.5 * 2^23 + n`, by adding `n` to the exponent: `p` and the result must be normal numbers.
+    fn scale(p: Self::V, t: Self::V) -> Self::V;
 
     fn zero() -> Self::V {
         Self::splat(0.0)
@@ -66,6 +68,19 @@ pub(crate) trait Simd: Copy + 'static {
         }
         lanes[0]
     }
+}
+
+/// Asks for the cache line of `value` in the second level; a hint that changes no result.
+#[inline(always)]
+pub(crate) fn prefetch(value: &f32) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: part of the x86-64 baseline, and of a readable address.
+    unsafe {
+        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T1>(std::ptr::from_ref(value).cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
 }
 
 /// `W` floats in an array; the compiler finds the vectors. `FMA` only where the target has the instruction, else
@@ -136,6 +151,10 @@ impl<const W: usize, const FMA: bool> Simd for Lanes<W, FMA> {
     #[inline(always)]
     fn exponent(t: Self::V) -> Self::V {
         lanewise!(W, |i| f32::from_bits(t[i].to_bits().wrapping_add(127) << 23))
+    }
+    #[inline(always)]
+    fn scale(p: Self::V, t: Self::V) -> Self::V {
+        lanewise!(W, |i| f32::from_bits(p[i].to_bits().wrapping_add(t[i].to_bits() << 23)))
     }
 }
 
@@ -214,6 +233,14 @@ mod avx2 {
             unsafe {
                 let n = _mm256_add_epi32(_mm256_castps_si256(t), _mm256_set1_epi32(127));
                 _mm256_castsi256_ps(_mm256_slli_epi32::<23>(n))
+            }
+        }
+        #[inline(always)]
+        fn scale(p: __m256, t: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe {
+                let n = _mm256_slli_epi32::<23>(_mm256_castps_si256(t));
+                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), n))
             }
         }
     }

@@ -41,6 +41,14 @@ pub(crate) fn with_optional<R>(tensor: Option<&Tensor>, f: impl FnOnce(Option<&[
     }
 }
 
+/// As [`with_values`], for any number.
+pub(crate) fn with_each<R>(tensors: &[&Tensor], f: impl FnOnce(&[&[f32]]) -> Result<R>) -> Result<R> {
+    let tensors = tensors.iter().map(|t| t.contiguous()).collect::<Result<Vec<_>>>()?;
+    let guards: Vec<_> = tensors.iter().map(Tensor::storage_and_layout).collect();
+    let values = tensors.iter().zip(&guards).map(|(t, (storage, layout))| slice(t, storage, layout));
+    f(&values.collect::<Result<Vec<_>>>()?)
+}
+
 /// As [`with_values`], for several.
 pub(crate) fn with_all<const N: usize, R>(
     tensors: [&Tensor; N],

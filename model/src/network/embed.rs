@@ -8,7 +8,7 @@ use super::stages::Stages;
 use crate::clip::ClipBatch;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, linear};
+use crate::ops::{Activation, Linear, linear, patches};
 use crate::rays::Rays;
 use crate::weights::names::TIME_CHANNELS;
 
@@ -45,21 +45,19 @@ impl Embed {
         let (p, d) = (self.patch, self.width);
         let (rows, cols) = (h / p, w / p);
         let views = b * t * v;
-        let pixels = Tensor::cat(&[&batch.image.reshape((views, 3, h, w))?, &rays.plucker], 1)?;
-        let patches = pixels
-            .reshape(vec![views, ModelConfig::INPUT_CHANNELS, rows, p, cols, p])?
-            .permute(vec![0, 2, 4, 1, 3, 5])?
-            .contiguous()?
-            .reshape((views * rows * cols, ModelConfig::INPUT_CHANNELS * p * p))?;
-        let tokens = linear(&patches, &self.proj.layer()?, Activation::None, None)?.reshape((views, rows * cols, d))?;
+        let patches = patches(&batch.image.reshape((views, 3, h, w))?, &rays.plucker, p)?;
+        let proj = self.proj.layer()?;
         if stages.wants("patch_embed") {
+            let tokens = linear(&patches, &proj, Activation::None, None)?;
             stages.keep("patch_embed", &tokens.reshape((views, rows, cols, d))?);
         }
-        let tokens = match self.position(rows, cols)? {
-            Some(position) => tokens.broadcast_add(&position)?,
-            None => tokens,
+        let time = self.time(batch, stages)?.reshape((views, 1, d))?;
+        let added = match self.position(rows, cols)? {
+            Some(position) => time.broadcast_add(&position)?,
+            None => time.broadcast_as((views, rows * cols, d))?,
         };
-        let tokens = tokens.broadcast_add(&self.time(batch, stages)?.reshape((views, 1, d))?)?;
+        let added = added.contiguous()?.reshape((views * rows * cols, d))?;
+        let tokens = linear(&patches, &proj, Activation::None, Some(&added))?;
         Ok(tokens.reshape((b, t * v * rows * cols, d))?)
     }
 

@@ -7,7 +7,8 @@ use super::params::Params;
 use super::stages::Stages;
 use crate::config::{ColorActivation, ColorBase, DepthActivation, ModelConfig};
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, linear};
+use crate::kernels::gaussians::Meaning;
+use crate::ops::{self, Activation, Linear, linear};
 use crate::rays::Rays;
 
 /// Per-pixel Gaussians, channel last.
@@ -46,6 +47,9 @@ impl GaussianHead {
         let (p, c) = (config.patch_size, ModelConfig::GAUSSIAN_CHANNELS);
         let raw = linear(tokens, &self.pred, Activation::None, None)?;
         stages.keep("gs_pred_raw", &raw);
+        if let Some(gaussians) = fused(config, &raw, image, rays)? {
+            return Ok(gaussians);
+        }
         let raw = raw
             .reshape(vec![b * t * v, h / p, w / p, p, p, c])?
             .permute(vec![0, 1, 3, 2, 4, 5])?
@@ -75,5 +79,122 @@ impl GaussianHead {
                 .squeeze(D::Minus1)?,
             colors,
         })
+    }
+}
+
+/// The same in one pass over the pixels, where no gradients are tracked and the kernel covers the tensors.
+fn fused(
+    config: &ModelConfig,
+    raw: &Tensor,
+    image: &Tensor,
+    rays: &Rays,
+) -> Result<Option<PixelGaussians>, ModelError> {
+    let &[b, t, v, _, h, w] = image.dims() else {
+        return Ok(None);
+    };
+    let meaning = Meaning {
+        patch: config.patch_size,
+        near: config.near,
+        far: config.far,
+        log_depth: config.depth_activation == DepthActivation::Log,
+        scale_offset: config.scale_offset,
+        // What the weights have: see `Storm::new`.
+        max_scale: config.max_scale as f32,
+        opacity_offset: config.opacity_offset,
+        squash_colors: config.color_activation == ColorActivation::TanhLike,
+        residual_colors: config.color == ColorBase::Residual,
+    };
+    let inputs = [raw, image, &rays.origins, &rays.directions];
+    let Some([means, scales, quats, opacities, colors, depths]) = ops::gaussians(&meaning, inputs, [b * t * v, h, w])?
+    else {
+        return Ok(None);
+    };
+    let tensor = |values: Vec<f32>, channels: usize| Tensor::from_vec(values, (b, t, v, h, w, channels), raw.device());
+    let scalar = |values: Vec<f32>| Tensor::from_vec(values, (b, t, v, h, w), raw.device());
+    Ok(Some(PixelGaussians {
+        means: tensor(means, 3)?,
+        scales: tensor(scales, 3)?,
+        quats: tensor(quats, 4)?,
+        opacities: scalar(opacities)?,
+        colors: tensor(colors, 3)?,
+        depths: scalar(depths)?,
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{Device, Var};
+
+    use super::*;
+
+    /// Values of up to a few hundred metres by an exponential each way.
+    const RELATIVE: f32 = 2e-6;
+
+    #[test]
+    fn the_kernel_is_the_plain_version() {
+        let device = Device::Cpu;
+        let noise = |seed: u64, dims: &[usize], scale: f32| {
+            Tensor::from_vec(crate::kernels::tests::noise(seed, dims.iter().product(), scale), dims, &device).unwrap()
+        };
+        for (k, patch) in [8, 3, 16].into_iter().enumerate() {
+            let (t, v, h, w) = (2, 2, 2 * patch, 3 * patch);
+            let base = ModelConfig { patch_size: patch, ..ModelConfig::preset("tiny").unwrap() };
+            for config in
+                [base.clone(), base.with_paper_choices(), ModelConfig { patch_size: patch, ..ModelConfig::default() }]
+            {
+                let max_scale = Tensor::new(config.max_scale as f32, &device).unwrap();
+                let outputs = patch * patch * ModelConfig::GAUSSIAN_CHANNELS;
+                let weight = noise(k as u64, &[outputs, 5], 2.0);
+                let head =
+                    |weight: Tensor| GaussianHead { pred: Linear::new(weight, None), max_scale: max_scale.clone() };
+                let tokens = noise(7, &[1, t * v * 6, 5], 2.0);
+                let image = noise(8, &[1, t, v, 3, h, w], 1.0);
+                let rays = Rays {
+                    origins: noise(9, &[1, t, v, 1, 1, 3], 5.0),
+                    directions: noise(10, &[1, t, v, h, w, 3], 1.0),
+                    plucker: noise(11, &[t * v, 6, h, w], 1.0),
+                };
+                let variable = Var::from_tensor(&weight).unwrap();
+                let run = |weight: Tensor| {
+                    head(weight).forward(&config, &tokens, &image, &rays, &mut Stages::none()).unwrap()
+                };
+                let (got, want) = (run(weight.clone()), run(variable.as_tensor().clone()));
+                let pairs = [
+                    (got.depths, want.depths),
+                    (got.means, want.means),
+                    (got.scales, want.scales),
+                    (got.quats, want.quats),
+                    (got.opacities, want.opacities),
+                    (got.colors, want.colors),
+                ];
+                for (i, (a, b)) in pairs.into_iter().enumerate() {
+                    assert_eq!(a.dims(), b.dims());
+                    let numbers = |x: Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+                    for (a, b) in numbers(a).into_iter().zip(numbers(b)) {
+                        assert!(
+                            (a - b).abs() <= RELATIVE * b.abs().max(1.0) * 3.0,
+                            "tensor {i}, patch {patch}: {a} {b}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn nan_is_not_lost() {
+        let device = Device::Cpu;
+        let config = ModelConfig::preset("tiny").unwrap();
+        let zeros = |dims: &[usize]| Tensor::zeros(dims, candle_core::DType::F32, &device).unwrap();
+        let rays = Rays {
+            origins: zeros(&[1, 1, 1, 1, 1, 3]),
+            directions: zeros(&[1, 1, 1, 8, 8, 3]),
+            plucker: zeros(&[1, 6, 8, 8]),
+        };
+        let raw = Tensor::full(f32::NAN, (1, 1, 768), &device).unwrap();
+        let all = fused(&config, &raw, &zeros(&[1, 1, 1, 3, 8, 8]), &rays).unwrap().unwrap();
+        for x in [all.depths, all.means, all.scales, all.quats, all.opacities, all.colors] {
+            assert!(x.flatten_all().unwrap().to_vec1::<f32>().unwrap().iter().all(|x| x.is_nan()));
+        }
     }
 }

@@ -4,10 +4,10 @@ use candle_core::{D, Tensor};
 
 use super::params::{Mlp, Params};
 use super::stages::Stages;
-use super::upsample::{Upsampler, unnest};
+use super::upsample::{Prepared, Upsampler};
 use crate::config::{MaskDecoder, ModelConfig, VelocityBases, VelocityKind, spread_bases};
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, linear, softmax};
+use crate::ops::{Activation, Linear, Step, chain, linear, softmax, unnest};
 
 /// Velocities of every pixel and how they came about.
 pub(crate) struct Motion {
@@ -34,9 +34,9 @@ pub(crate) struct MotionHead {
 /// The picture whose pixel-wise stages are kept for comparison: timestep 0, camera 1 (camera 0 of one-camera windows).
 const PROBED_PICTURE: usize = 1;
 
-/// Pixels that go through the upsampler and the decoder at a time: their features stay in the processor's caches, and a whole
-/// window's would not fit in memory at full size.
-const PART_PIXELS: usize = 1 << 15;
+/// Pixels that go through the upsampler and the decoder at a time: a whole window's features would not fit in memory at full
+/// size.
+const PART_PIXELS: usize = 1 << 17;
 
 /// Pictures of one window that are decoded together.
 struct Part {
@@ -117,20 +117,15 @@ impl MotionHead {
             let probed = first == PROBED_PICTURE.min(t * v - 1);
             let stages = if probed { &mut *stages } else { &mut none };
             let tokens = pictures.narrow(0, first, count)?.reshape((count * grid.0 * grid.1, config.embed_dim))?;
-            let features = upsampler.forward(&tokens, grid, stages)?;
-            let keys = self.keys.forward(&features)?;
-            if stages.wants("motion_keys") {
-                stages.keep("motion_keys", &unnest(&keys, grid, levels)?.get(0)?);
-            }
+            let queries = mixture.as_ref().map(|(queries, _)| queries.get(window)).transpose()?;
+            let decoded = self.decode(&upsampler, &tokens, grid, queries, config.tau, stages)?;
             let velocity = match &mixture {
-                Some((queries, bases)) => {
-                    let logits = product(&keys, queries.get(window)?)?;
-                    let weights = softmax(&logits, config.tau)?;
-                    let velocity = product(&weights, bases.get(window)?.t()?.contiguous()?)?;
-                    all_weights.push(unnest(&weights, grid, levels)?);
+                Some((_, bases)) => {
+                    let velocity = product(&decoded, bases.get(window)?.t()?.contiguous()?)?;
+                    all_weights.push(unnest(&decoded, grid, levels)?);
                     velocity
                 }
-                None => (self.bases[0].forward(&keys)? * config.velocity_scale)?,
+                None => (self.bases[0].forward(&decoded)? * config.velocity_scale)?,
             };
             all_velocities.push(unnest(&velocity, grid, levels)?);
         }
@@ -148,6 +143,46 @@ impl MotionHead {
             }
         };
         Ok(Motion { velocity_backward, velocity_forward, weights, bases: mixture.map(|(_, bases)| bases) })
+    }
+
+    /// Motion weights `(pixels, M)` of pictures' `tokens` `(patches, d)` in nested order; without queries their keys `(pixels, e)`.
+    fn decode(
+        &self,
+        upsampler: &Prepared<'_>,
+        tokens: &Tensor,
+        grid: (usize, usize),
+        queries: Option<Tensor>,
+        tau: f64,
+        stages: &mut Stages,
+    ) -> Result<Tensor, ModelError> {
+        if stages.asked() {
+            let features = upsampler.forward(tokens, grid, stages)?;
+            let keys = self.keys.forward(&features)?;
+            if stages.wants("motion_keys") {
+                let levels = upsampler.steps().count();
+                stages.keep("motion_keys", &unnest(&keys, grid, levels)?.get(0)?);
+            }
+            return Ok(match queries {
+                Some(queries) => softmax(&product(&keys, queries)?, tau)?,
+                None => keys,
+            });
+        }
+        // The last doubling's features are the widest: they go on to the weights without ever being a tensor.
+        let mut x = tokens.clone();
+        let mut doublings = upsampler.steps().peekable();
+        let mut steps = Vec::new();
+        while let Some(doubling) = doublings.next() {
+            match doublings.peek() {
+                Some(_) => x = chain(&x, &doubling, None)?,
+                None => steps = doubling,
+            }
+        }
+        steps.extend(self.keys.steps());
+        let width = queries.as_ref().map(|queries| queries.dim(0)).transpose()?;
+        let queries = queries.map(|queries| Linear::new(queries, None));
+        steps.extend(queries.iter().map(|queries| Step::Linear(queries, Activation::None)));
+        steps.extend(width.map(|width| Step::Softmax { width, tau }));
+        Ok(chain(&x, &steps, None)?)
     }
 
     /// Queries `(b, M, e)` and scaled bases `(b, M, 3 | 6)` of the motion tokens.

@@ -2,12 +2,14 @@
 
 use std::sync::Arc;
 
-use candle_core::{D, DType, Tensor};
+use candle_core::{D, DType, Device, Tensor};
+use rayon::prelude::*;
 use storm_render::Gaussians;
 
 use super::sky::SkyHead;
 use crate::config::{AffineKind, ModelConfig};
 use crate::error::ModelError;
+use crate::kernels::tensors::with_values;
 use crate::scene::{Affine, Scene, SceneShape, SkyModel};
 
 /// Tensors of a forward pass; metres, seconds, m/s, in the window's world. Gradients flow through all of them.
@@ -80,22 +82,20 @@ impl ClipOutput {
             return Err(ModelError::Input(format!("window {index} of a batch of {b}")));
         }
         let read = |name: &str, x: &Tensor| plain(name, &x.get(index)?);
+        let triples = |name: &str, x: &Tensor| rows::<3>(name, &x.get(index)?);
         let times = read("time_sec", &self.time_sec)?;
         let (motion_count, motion_weights) = match &self.motion_weights {
             Some(weights) => (weights.dim(D::Minus1)?, read("motion_weights", weights)?),
             None => (0, Vec::new()),
         };
         let gaussians = Gaussians {
-            means: read("means", &self.means)?.chunks_exact(3).map(triple).collect(),
-            quats: read("quats", &self.quats)?.chunks_exact(4).map(|q| [q[0], q[1], q[2], q[3]]).collect(),
-            scales: read("scales", &self.scales)?.chunks_exact(3).map(triple).collect(),
+            means: triples("means", &self.means)?,
+            quats: rows::<4>("quats", &self.quats.get(index)?)?,
+            scales: triples("scales", &self.scales)?,
             opacities: read("opacities", &self.opacities)?,
-            colors: read("colors", &self.colors)?.chunks_exact(3).map(triple).collect(),
-            velocity_backward: read("velocity_backward", &self.velocity_backward)?
-                .chunks_exact(3)
-                .map(triple)
-                .collect(),
-            velocity_forward: read("velocity_forward", &self.velocity_forward)?.chunks_exact(3).map(triple).collect(),
+            colors: triples("colors", &self.colors)?,
+            velocity_backward: triples("velocity_backward", &self.velocity_backward)?,
+            velocity_forward: triples("velocity_forward", &self.velocity_forward)?,
             time_sec: times.iter().flat_map(|&time| std::iter::repeat_n(time, h * w)).collect(),
             motion_count,
             motion_weights,
@@ -130,18 +130,29 @@ impl ClipOutput {
     }
 }
 
-fn triple(x: &[f32]) -> [f32; 3] {
-    [x[0], x[1], x[2]]
-}
+/// Values a task checks and copies.
+const TASK_FLOATS: usize = 64 * 1024;
 
 /// All values of a tensor on the host, refused when one is not finite.
 fn plain(name: &str, x: &Tensor) -> Result<Vec<f32>, ModelError> {
-    let values = x.flatten_all()?.to_dtype(DType::F32)?.to_vec1::<f32>()?;
-    let count = values.iter().filter(|x| !x.is_finite()).count();
-    if count > 0 {
-        return Err(ModelError::NonFinite { tensor: name.to_owned(), count });
-    }
-    Ok(values)
+    Ok(rows::<1>(name, x)?.into_iter().map(|[x]| x).collect())
+}
+
+/// All values of a tensor on the host in rows of `N`, refused when one is not finite.
+fn rows<const N: usize>(name: &str, x: &Tensor) -> Result<Vec<[f32; N]>, ModelError>
+where
+    [f32; N]: bytemuck::Pod,
+{
+    let host = x.to_device(&Device::Cpu)?.to_dtype(DType::F32)?;
+    let values = with_values(&host, |values| {
+        let Ok(values) = bytemuck::try_cast_slice::<f32, [f32; N]>(values) else {
+            candle_core::bail!("{name}: {} values are no rows of {N}", values.len());
+        };
+        let bad = |part: &[[f32; N]]| part.as_flattened().iter().map(|x| usize::from(!x.is_finite())).sum::<usize>();
+        let count: usize = values.par_chunks(TASK_FLOATS / N).map(bad).sum();
+        Ok(if count == 0 { Ok(values.to_vec()) } else { Err(count) })
+    })?;
+    values.map_err(|count| ModelError::NonFinite { tensor: name.to_owned(), count })
 }
 
 fn sky_model(config: &ModelConfig, head: &SkyHead, token: &Tensor) -> Result<SkyModel, ModelError> {

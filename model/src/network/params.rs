@@ -3,7 +3,7 @@
 use candle_core::Tensor;
 
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, layer_norm, linear, mlp};
+use crate::ops::{Activation, Linear, Step, chain, layer_norm};
 use crate::weights::{Tensors, WeightsError};
 
 /// Epsilon of every layer norm.
@@ -44,6 +44,11 @@ impl Norm {
     pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
         layer_norm(x, Some(&self.weight), Some(&self.bias), NORM_EPS)
     }
+
+    /// The same as part of a chain.
+    pub fn step(&self, act: Activation) -> Step<'_> {
+        Step::Norm { weight: &self.weight, bias: &self.bias, eps: NORM_EPS, act }
+    }
 }
 
 /// A linear layer whose matrix is a stored weight in another arrangement (convolutions written as matrix products).
@@ -78,14 +83,12 @@ pub(crate) struct Mlp(Vec<Linear>);
 
 impl Mlp {
     pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        if let [first, second] = &self.0[..] {
-            return mlp(x, first, Activation::Gelu, second, None);
-        }
-        let mut x = x.clone();
-        for (k, layer) in self.0.iter().enumerate() {
-            let act = if k + 1 < self.0.len() { Activation::Gelu } else { Activation::None };
-            x = linear(&x, layer, act, None)?;
-        }
-        Ok(x)
+        chain(x, &self.steps().collect::<Vec<_>>(), None)
+    }
+
+    /// The layers as part of a chain.
+    pub fn steps(&self) -> impl Iterator<Item = Step<'_>> {
+        let act = |k: usize| if k + 1 < self.0.len() { Activation::Gelu } else { Activation::None };
+        self.0.iter().enumerate().map(move |(k, layer)| Step::Linear(layer, act(k)))
     }
 }

@@ -6,7 +6,7 @@ use super::params::{Norm, Params};
 use super::stages::Stages;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, attention, linear, mlp};
+use crate::ops::{Activation, Linear, Step, attention, chain, linear};
 
 #[derive(Debug, Clone)]
 struct Block {
@@ -67,16 +67,19 @@ type Probe<'a> = dyn FnMut(&str, &dyn Fn() -> candle_core::Result<Tensor>) -> ca
 
 impl Block {
     fn forward(&self, x: &Tensor, heads: usize, probe: &mut Probe<'_>) -> candle_core::Result<Tensor> {
-        let y = self.norm1.forward(x)?;
-        probe("norm1", &|| Ok(y.clone()))?;
-        let qkv = linear(&y, &self.qkv, Activation::None, None)?;
+        probe("norm1", &|| self.norm1.forward(x))?;
+        let qkv = chain(x, &[self.norm1.step(Activation::None), Step::Linear(&self.qkv, Activation::None)], None)?;
         probe("attn.qkv", &|| Ok(qkv.clone()))?;
         let attended = linear(&attention(&qkv, heads)?, &self.proj, Activation::None, Some(x))?;
         drop(qkv);
         probe("attn", &|| &attended - x)?;
-        let y = self.norm2.forward(&attended)?;
-        probe("norm2", &|| Ok(y.clone()))?;
-        let out = mlp(&y, &self.fc1, Activation::Gelu, &self.fc2, Some(&attended))?;
+        probe("norm2", &|| self.norm2.forward(&attended))?;
+        let steps = [
+            self.norm2.step(Activation::None),
+            Step::Linear(&self.fc1, Activation::Gelu),
+            Step::Linear(&self.fc2, Activation::None),
+        ];
+        let out = chain(&attended, &steps, Some(&attended))?;
         probe("mlp", &|| &out - &attended)?;
         Ok(out)
     }

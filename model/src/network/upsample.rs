@@ -10,7 +10,7 @@ use super::params::{Arranged, Norm, Params};
 use super::stages::Stages;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, gelu, linear};
+use crate::ops::{Activation, Linear, Step, gelu, linear, unnest};
 use crate::weights::names::upsampler_norm;
 
 #[derive(Debug, Clone)]
@@ -76,6 +76,14 @@ impl Prepared<'_> {
         }
         Ok(x)
     }
+
+    /// The layers of each doubling as parts of a chain.
+    pub fn steps(&self) -> impl Iterator<Item = Vec<Step<'_>>> {
+        self.0.iter().map(|(layer, stage)| match &stage.norm {
+            Some(norm) => vec![Step::Linear(layer, Activation::None), norm.step(Activation::Gelu)],
+            None => vec![Step::Linear(layer, Activation::Gelu)],
+        })
+    }
 }
 
 fn keep(stages: &mut Stages, layer: usize, x: &Tensor, grid: (usize, usize), levels: usize) -> Result<()> {
@@ -84,21 +92,6 @@ fn keep(stages: &mut Stages, layer: usize, x: &Tensor, grid: (usize, usize), lev
         stages.keep(&name, &unnest(x, grid, levels)?.get(0)?);
     }
     Ok(())
-}
-
-/// `(n rows cols 4^levels, c)`, each of the `n` pictures in nested order, to `(n, rows 2^levels, cols 2^levels, c)`.
-pub(crate) fn unnest(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<Tensor> {
-    let (all, c) = x.dims2()?;
-    let side = 1 << levels;
-    let pictures = all / (grid.0 * grid.1 * side * side).max(1);
-    let mut shape = vec![pictures, grid.0, grid.1];
-    shape.extend(std::iter::repeat_n(2, 2 * levels));
-    shape.push(c);
-    // Axes: picture, row, col, then (row bit, col bit) per level, coarse to fine.
-    let rows = std::iter::once(1).chain((0..levels).map(|k| 3 + 2 * k));
-    let cols = std::iter::once(2).chain((0..levels).map(|k| 4 + 2 * k));
-    let axes: Vec<usize> = std::iter::once(0).chain(rows).chain(cols).chain(std::iter::once(3 + 2 * levels)).collect();
-    x.reshape(shape)?.permute(axes)?.contiguous()?.reshape((pictures, grid.0 * side, grid.1 * side, c))
 }
 
 #[cfg(test)]

@@ -21,6 +21,12 @@ pub unsafe fn set_up_training() {
         // SAFETY: the caller's contract.
         unsafe { std::env::set_var(CANDLE_THREADS, "1") };
     }
+    keep_freed_memory();
+}
+
+/// With glibc, memory that was freed stays with the process for the next step instead of being handed back to the system and
+/// fetched, page by page, again. The process stays as large as its largest step; elsewhere this does nothing.
+pub fn keep_freed_memory() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     glibc::keep_freed_memory();
 }

@@ -115,6 +115,8 @@ impl Engine {
     /// Ready for windows of `cameras` cameras. `timespan_sec` is what the network's clock is divided by.
     pub fn new(source: ModelSource, section: &ModelConfigSection, cameras: usize, timespan_sec: f64) -> Result<Self> {
         let device = device(&section.device)?;
+        // Every step takes and frees the same some tens of megabytes.
+        storm_model::ops::keep_freed_memory();
         let (model, weights) = match source {
             ModelSource::Loaded { mut config, mut tensors, name } => {
                 weights::for_cameras(&mut config, &mut tensors, cameras)?;

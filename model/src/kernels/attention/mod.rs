@@ -6,20 +6,24 @@
 //! tiles (in units of log 2, so that the softmax is a power of two), turns them into weights row by row, and adds the
 //! weighted values to its output block. All blocks of a task fit the second-level cache.
 //!
-//! Logits may be of any finite size: the largest so far is subtracted before the power is taken, so weights are at most
+//! Where the lengths of a task's queries and of its head's keys bound every logit by `FLAT_LOGITS`, nothing is subtracted: the
+//! softmax does not depend on it and no power can overflow or vanish, so weights are taken as the logits leave the registers.
+//! Else logits may be of any finite size: the largest so far is subtracted before the power is taken, so weights are at most
 //! 1 and the sum at least 1. A NaN in a query, key or value reaches every output that depends on it.
 
 mod backward;
 mod pack;
+
+use std::cell::RefCell;
 
 use rayon::prelude::*;
 
 use super::Isa;
 use super::aligned::Aligned;
 use super::gemm::tile;
-use super::math::exp2;
+use super::math::{exp2, exp2_short};
 use super::simd::{Kernel, Simd, dispatch};
-use pack::{Layout, Source, pack};
+use pack::{Layout, Sizes, Source, pack};
 
 pub use backward::{Source as BackwardSource, attention_backward};
 pub use pack::Shape;
@@ -29,21 +33,24 @@ const BLOCK_QUERIES: usize = 96;
 /// Keys taken at a time. The logits of a task are `96 x 256` floats, 96 KiB.
 const BLOCK_KEYS: usize = 256;
 
+/// Logits (in units of log 2) up to which weights are plain powers: weights lie within `2^-60..2^60` then.
+const FLAT_LOGITS: f32 = 60.0;
+/// Lengths of values up to which sums of such weights times values stay in range.
+const FLAT_VALUES: f32 = 1.1e12;
+
 /// Working memory of a task, kept by its thread.
+#[derive(Default)]
 struct Scratch {
     queries: Aligned,
     weights: Aligned,
     sums: Aligned,
+    totals: Aligned,
 }
 
-impl Scratch {
-    fn new(shape: &Shape, layout: &Layout) -> Self {
-        Self {
-            queries: Aligned::zeroed(BLOCK_QUERIES * shape.head_dim),
-            weights: Aligned::zeroed(BLOCK_QUERIES * BLOCK_KEYS),
-            sums: Aligned::zeroed(BLOCK_QUERIES * layout.value_dim),
-        }
-    }
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+    /// Packed keys and values of the last call from this thread.
+    static PACKED: RefCell<Aligned> = RefCell::default();
 }
 
 /// The result, written by tasks that own disjoint rows and columns of it.
@@ -75,6 +82,8 @@ struct Task<'a> {
     layout: &'a Layout,
     /// Packed blocks of this head.
     blocks: &'a [f32],
+    /// The largest of them.
+    sizes: Sizes,
     scratch: &'a mut Scratch,
     out: Output,
     /// Log-sum-exp of each query's logits in units of log 2, `(batch, heads, tokens)`, where it is kept.
@@ -91,72 +100,51 @@ impl Kernel for Task<'_> {
         let (d, nr) = (shape.head_dim, 2 * S::W);
         let queries = BLOCK_QUERIES.min(shape.tokens - first);
         let panels = queries.div_ceil(MR);
-        let Scratch { queries: packed, weights, sums } = self.scratch;
-        let (q, weights, sums) = (packed.as_mut_slice(), weights.as_mut_slice(), sums.as_mut_slice());
-        self.source.pack_queries::<MR>(q, queries);
+        let Scratch { queries: q, weights, sums, totals } = self.scratch;
+        let q = q.at_least(BLOCK_QUERIES * d);
+        let weights = weights.at_least(BLOCK_QUERIES * BLOCK_KEYS);
+        let sums = sums.at_least(BLOCK_QUERIES * layout.value_dim);
+        let query = self.source.pack_queries::<MR>(q, queries);
         sums.fill(0.0);
-        let mut largest = [f32::MIN; BLOCK_QUERIES];
+        let mut largest = [0f32; BLOCK_QUERIES];
         let mut total = [0f32; BLOCK_QUERIES];
         let mut shrink = [0f32; BLOCK_QUERIES];
+        let flat = query * self.sizes.key <= FLAT_LOGITS * FLAT_LOGITS && self.sizes.value <= FLAT_VALUES * FLAT_VALUES;
+        let totals = totals.at_least(BLOCK_QUERIES * S::W);
+        match flat {
+            true => totals.fill(0.0),
+            false => largest.fill(f32::MIN),
+        }
 
         for (index, block) in self.blocks.chunks_exact(layout.block_floats).enumerate() {
             let count = BLOCK_KEYS.min(shape.tokens - index * BLOCK_KEYS);
-            let key_panels = count.div_ceil(nr);
             let (keys, values) = block.split_at(layout.key_floats);
-
-            for j in 0..key_panels {
-                let b = &keys[j * d * nr..][..d * nr];
-                for i in 0..panels {
-                    let a = &q[i * d * MR..][..d * MR];
-                    let to = &mut weights[i * MR * BLOCK_KEYS..][..MR * BLOCK_KEYS];
-                    // SAFETY: `a` has `d` columns of MR, `b` `d` rows of two vectors; `to` MR rows of BLOCK_KEYS, of
-                    // which panel `j < key_panels` is inside.
-                    unsafe {
-                        let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [[S::zero(); 2]; MR]);
-                        for r in 0..MR {
-                            let row = to.as_mut_ptr().add(r * BLOCK_KEYS + j * nr);
-                            S::store(row, acc[r][0]);
-                            S::store(row.add(S::W), acc[r][1]);
-                        }
-                    }
-                }
+            if flat {
+                flat_weights::<S, MR>(&q[..panels * MR * d], d, keys, count, weights, totals);
+                add_values::<S, MR>(weights, values, layout, count, panels, None, sums);
+                continue;
             }
-
+            logits::<S, MR>(&q[..panels * MR * d], d, keys, count, weights);
+            let width = count.next_multiple_of(nr);
             for r in 0..panels * MR {
-                let row = &mut weights[r * BLOCK_KEYS..][..key_panels * nr];
+                let row = &mut weights[r * BLOCK_KEYS..][..width];
                 row[count..].fill(f32::MIN);
                 shrink[r] = largest[r];
                 largest[r] = row_largest::<S>(row, largest[r]);
             }
             shrink_sums::<S>(&mut shrink, &largest, &mut total);
             for r in 0..panels * MR {
-                let row = &mut weights[r * BLOCK_KEYS..][..key_panels * nr];
+                let row = &mut weights[r * BLOCK_KEYS..][..width];
                 total[r] += row_weights::<S>(row, largest[r]);
             }
-
-            for c in 0..layout.value_dim / nr {
-                let b = &values[c * layout.keys * nr..][..count * nr];
-                for i in 0..panels {
-                    let a = &weights[i * MR * BLOCK_KEYS..][..MR * BLOCK_KEYS];
-                    let to = &mut sums[(c * BLOCK_QUERIES + i * MR) * nr..][..MR * nr];
-                    // SAFETY: `a` has MR rows of BLOCK_KEYS >= count, `b` `count` rows of two vectors, `to` MR such rows.
-                    unsafe {
-                        let mut acc = [[S::zero(); 2]; MR];
-                        for r in 0..MR {
-                            let keep = S::splat(shrink[i * MR + r]);
-                            acc[r][0] = S::mul(keep, S::load(to.as_ptr().add(r * nr)));
-                            acc[r][1] = S::mul(keep, S::load(to.as_ptr().add(r * nr + S::W)));
-                        }
-                        let acc = tile::<S, MR>(count, a.as_ptr(), 1, BLOCK_KEYS, b.as_ptr(), acc);
-                        for r in 0..MR {
-                            S::store(to.as_mut_ptr().add(r * nr), acc[r][0]);
-                            S::store(to.as_mut_ptr().add(r * nr + S::W), acc[r][1]);
-                        }
-                    }
-                }
+            add_values::<S, MR>(weights, values, layout, count, panels, Some(&shrink), sums);
+        }
+        if flat {
+            for (total, lanes) in total.iter_mut().zip(totals.chunks_exact(S::W)) {
+                // SAFETY: the chunk has one vector.
+                *total = S::sum(unsafe { S::load(lanes.as_ptr()) });
             }
         }
-
         if let Some(log_sums) = self.log_sums {
             // SAFETY: batch, head and query block identify the task, so no other task writes these.
             let to = unsafe { log_sums.row((batch * shape.heads + head) * shape.tokens + first, queries) };
@@ -170,6 +158,99 @@ impl Kernel for Task<'_> {
             for (c, part) in row.chunks_mut(nr).enumerate() {
                 let from = &sums[(c * BLOCK_QUERIES + r) * nr..][..part.len()];
                 part.iter_mut().zip(from).for_each(|(o, s)| *o = s * scale);
+            }
+        }
+    }
+}
+
+/// Logits of whole row panels of queries against `count` keys, rows of [`BLOCK_KEYS`].
+#[inline(always)]
+fn logits<S: Simd, const MR: usize>(q: &[f32], d: usize, keys: &[f32], count: usize, weights: &mut [f32]) {
+    let nr = 2 * S::W;
+    for (j, b) in keys.chunks_exact(d * nr).take(count.div_ceil(nr)).enumerate() {
+        for (a, to) in q.chunks_exact(d * MR).zip(weights.chunks_exact_mut(MR * BLOCK_KEYS)) {
+            // SAFETY: `a` has `d` columns of MR, `b` `d` rows of two vectors; `to` MR rows of BLOCK_KEYS, of which panel `j`
+            // is inside.
+            unsafe {
+                let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [[S::zero(); 2]; MR]);
+                for r in 0..MR {
+                    let row = to.as_mut_ptr().add(r * BLOCK_KEYS + j * nr);
+                    S::store(row, acc[r][0]);
+                    S::store(row.add(S::W), acc[r][1]);
+                }
+            }
+        }
+    }
+}
+
+/// As [`logits`], but weights `2^logit`, for logits within [`FLAT_LOGITS`]; `totals` are partial sums, a vector a row.
+#[inline(always)]
+fn flat_weights<S: Simd, const MR: usize>(
+    q: &[f32],
+    d: usize,
+    keys: &[f32],
+    count: usize,
+    weights: &mut [f32],
+    totals: &mut [f32],
+) {
+    let nr = 2 * S::W;
+    for (j, b) in keys.chunks_exact(d * nr).take(count.div_ceil(nr)).enumerate() {
+        let valid = nr.min(count - j * nr);
+        let panels = q.chunks_exact(d * MR).zip(weights.chunks_exact_mut(MR * BLOCK_KEYS));
+        for ((a, to), totals) in panels.zip(totals.chunks_exact_mut(MR * S::W)) {
+            // SAFETY: `a` has `d` columns of MR, `b` `d` rows of two vectors; `to` MR rows of BLOCK_KEYS, of which panel `j`
+            // is inside; `totals` MR vectors.
+            unsafe {
+                let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [[S::zero(); 2]; MR]);
+                for r in 0..MR {
+                    let row = to.as_mut_ptr().add(r * BLOCK_KEYS + j * nr);
+                    let (mut low, mut high) = (exp2_short::<S>(acc[r][0]), exp2_short::<S>(acc[r][1]));
+                    S::store(row, low);
+                    S::store(row.add(S::W), high);
+                    if valid < nr {
+                        (valid..nr).for_each(|c| row.add(c).write(0.0));
+                        (low, high) = (S::load(row), S::load(row.add(S::W)));
+                    }
+                    let sum = totals.as_mut_ptr().add(r * S::W);
+                    S::store(sum, S::add(S::load(sum), S::add(low, high)));
+                }
+            }
+        }
+    }
+}
+
+/// `sums = shrink * sums + weights * values` for the row panels of a task.
+#[inline(always)]
+fn add_values<S: Simd, const MR: usize>(
+    weights: &[f32],
+    values: &[f32],
+    layout: &Layout,
+    count: usize,
+    panels: usize,
+    shrink: Option<&[f32; BLOCK_QUERIES]>,
+    sums: &mut [f32],
+) {
+    let nr = 2 * S::W;
+    for c in 0..layout.value_dim / nr {
+        let b = &values[c * layout.keys * nr..][..count * nr];
+        for i in 0..panels {
+            let a = &weights[i * MR * BLOCK_KEYS..][..MR * BLOCK_KEYS];
+            let to = &mut sums[(c * BLOCK_QUERIES + i * MR) * nr..][..MR * nr];
+            // SAFETY: `a` has MR rows of BLOCK_KEYS >= count, `b` `count` rows of two vectors, `to` MR such rows.
+            unsafe {
+                let mut acc = [[S::zero(); 2]; MR];
+                for r in 0..MR {
+                    acc[r] = [S::load(to.as_ptr().add(r * nr)), S::load(to.as_ptr().add(r * nr + S::W))];
+                    if let Some(shrink) = shrink {
+                        let keep = S::splat(shrink[i * MR + r]);
+                        acc[r] = [S::mul(keep, acc[r][0]), S::mul(keep, acc[r][1])];
+                    }
+                }
+                let acc = tile::<S, MR>(count, a.as_ptr(), 1, BLOCK_KEYS, b.as_ptr(), acc);
+                for r in 0..MR {
+                    S::store(to.as_mut_ptr().add(r * nr), acc[r][0]);
+                    S::store(to.as_mut_ptr().add(r * nr + S::W), acc[r][1]);
+                }
             }
         }
     }
@@ -252,23 +333,31 @@ fn run(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32], log_sums: Option<Ou
     }
     let layout = Layout::new(isa, &shape);
     let head_floats = layout.blocks * layout.block_floats;
-    let mut packed = Aligned::zeroed(shape.batch * shape.heads * head_floats);
-    packed.as_mut_slice().par_chunks_exact_mut(layout.block_floats).enumerate().for_each(|(index, block)| {
-        pack(qkv, &shape, &layout, index, block);
+    let mut memory = PACKED.take();
+    let packed = memory.at_least(shape.batch * shape.heads * head_floats);
+    let mut sizes = vec![Sizes::default(); shape.batch * shape.heads * layout.blocks];
+    packed.par_chunks_exact_mut(layout.block_floats).zip(&mut sizes).enumerate().for_each(|(index, (block, sizes))| {
+        *sizes = pack(qkv, &shape, &layout, index, block);
     });
-    let packed = packed.as_slice();
+    let packed = &*packed;
+    let sizes: Vec<Sizes> = sizes
+        .chunks_exact(layout.blocks)
+        .map(|head| head.iter().copied().reduce(Sizes::or).unwrap_or_default())
+        .collect();
     let query_blocks = shape.tokens.div_ceil(BLOCK_QUERIES);
     let output = Output { start: out.as_mut_ptr(), len: out.len() };
-    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each_init(
-        || Scratch::new(&shape, &layout),
-        |scratch, index| {
-            let (head_index, query_block) = (index / query_blocks, index % query_blocks);
-            let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
-            let source = Source { qkv, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
-            let blocks = &packed[head_index * head_floats..][..head_floats];
-            dispatch(isa, Task { source, layout: &layout, blocks, scratch, out: output, log_sums });
-        },
-    );
+    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {
+        let (head_index, query_block) = (index / query_blocks, index % query_blocks);
+        let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
+        let source = Source { qkv, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
+        let blocks = &packed[head_index * head_floats..][..head_floats];
+        // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
+        SCRATCH.with_borrow_mut(|scratch| {
+            let sizes = sizes[head_index];
+            dispatch(isa, Task { source, layout: &layout, blocks, sizes, scratch, out: output, log_sums });
+        });
+    });
+    PACKED.set(memory);
 }
 
 #[cfg(test)]
@@ -331,6 +420,34 @@ mod tests {
                 attention(isa, &qkv, s, &mut out);
                 let worst = worst_difference(&out, &reference(&qkv, s));
                 assert!(worst < TOLERANCE, "{isa:?} {s:?}: {worst:e}");
+            }
+        }
+    }
+
+    #[test]
+    fn either_way_to_the_weights_in_used_memory() {
+        let s = Shape { batch: 1, tokens: 301, heads: 2, head_dim: 20 };
+        let row = 3 * s.width();
+        for isa in Isa::tested() {
+            // Each head's queries times this: lengths bound the logits of neither, one or both heads.
+            for (i, scales) in [[0.5, 0.5], [0.5, 30.0], [30.0, 30.0]].into_iter().enumerate() {
+                let mut qkv = noise(40 + i as u64, s.tokens * row, 1.0);
+                for (j, x) in qkv.iter_mut().enumerate().filter(|(j, _)| j % row < s.width()) {
+                    *x *= scales[j % row / s.head_dim];
+                }
+                let mut out = vec![f32::NAN; s.tokens * s.width()];
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+                pool.install(|| {
+                    PACKED.with_borrow_mut(|memory| memory.at_least(1 << 17).fill(f32::NAN));
+                    SCRATCH.with_borrow_mut(|Scratch { queries, weights, sums, totals }| {
+                        for memory in [queries, weights, sums, totals] {
+                            memory.at_least(1 << 16).fill(f32::NAN);
+                        }
+                    });
+                    attention(isa, &qkv, s, &mut out);
+                });
+                let worst = worst_difference(&out, &reference(&qkv, s));
+                assert!(worst < 10.0 * TOLERANCE, "{isa:?} {scales:?}: {worst:e}");
             }
         }
     }

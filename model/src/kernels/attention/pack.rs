@@ -51,13 +51,51 @@ impl Layout {
     }
 }
 
-/// Packs the keys `(panel, channel, key)` and values `(panel, key, channel)` of one block; `block` starts as zeros.
-pub(super) fn pack(qkv: &[f32], shape: &Shape, layout: &Layout, index: usize, block: &mut [f32]) {
+/// How large what a block holds is; NaN where it holds one.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Sizes {
+    /// Longest key, squared.
+    pub(super) key: f32,
+    /// Longest value, squared.
+    pub(super) value: f32,
+}
+
+impl Sizes {
+    /// The larger of both, NaN before anything.
+    pub(super) fn or(self, other: Self) -> Self {
+        Self { key: larger(self.key, other.key), value: larger(self.value, other.value) }
+    }
+}
+
+/// The larger number, or NaN if there is one.
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a >= b || a.is_nan() { a } else { b }
+}
+
+/// Sum of squares over eight interleaved partial sums.
+#[inline(always)]
+fn squares(x: &[f32]) -> f32 {
+    let mut partial = [0f32; 8];
+    let mut chunks = x.chunks_exact(8);
+    for chunk in &mut chunks {
+        for l in 0..8 {
+            partial[l] += chunk[l] * chunk[l];
+        }
+    }
+    partial.iter().sum::<f32>() + chunks.remainder().iter().map(|v| v * v).sum::<f32>()
+}
+
+/// Packs the keys `(panel, channel, key)` and values `(panel, key, channel)` of one block, with zeros where there are none.
+pub(super) fn pack(qkv: &[f32], shape: &Shape, layout: &Layout, index: usize, block: &mut [f32]) -> Sizes {
     let (head_index, first) = (index / layout.blocks, index % layout.blocks * BLOCK_KEYS);
     let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
     let (d, width, nr) = (shape.head_dim, shape.width(), layout.nr);
     let (keys, values) = block.split_at_mut(layout.key_floats);
-    for t in 0..BLOCK_KEYS.min(shape.tokens - first) {
+    let count = BLOCK_KEYS.min(shape.tokens - first);
+    keys[count / nr * d * nr..].fill(0.0);
+    let mut sizes = Sizes::default();
+    for t in 0..count {
         let row = &qkv[(batch * shape.tokens + first + t) * 3 * width..][..3 * width];
         let key = &row[width + head * d..][..d];
         let panel = &mut keys[t / nr * d * nr..][..d * nr];
@@ -66,9 +104,13 @@ pub(super) fn pack(qkv: &[f32], shape: &Shape, layout: &Layout, index: usize, bl
         }
         let value = &row[2 * width + head * d..][..d];
         for (p, part) in value.chunks(nr).enumerate() {
-            values[(p * layout.keys + t) * nr..][..part.len()].copy_from_slice(part);
+            let to = &mut values[(p * layout.keys + t) * nr..][..nr];
+            to[..part.len()].copy_from_slice(part);
+            to[part.len()..].fill(0.0);
         }
+        sizes = sizes.or(Sizes { key: squares(key), value: squares(value) });
     }
+    sizes
 }
 
 /// One block of queries of one head.
@@ -82,19 +124,28 @@ pub(super) struct Source<'a> {
 }
 
 impl Source<'_> {
-    /// Row panels of `MR` queries, scaled; rows past the end are zeros.
+    /// Row panels of `MR` queries, scaled; the last query again past the end. Returns the square of the longest scaled query.
     #[inline(always)]
-    pub(super) fn pack_queries<const MR: usize>(&self, packed: &mut [f32], queries: usize) {
+    pub(super) fn pack_queries<const MR: usize>(&self, packed: &mut [f32], queries: usize) -> f32 {
         let (d, width) = (self.shape.head_dim, self.shape.width());
         let scale = std::f32::consts::LOG2_E / (d as f32).sqrt();
-        packed.fill(0.0);
-        for r in 0..queries {
-            let row = (self.batch * self.shape.tokens + self.first + r) * 3 * width + self.head * d;
-            let panel = &mut packed[r / MR * d * MR..][..d * MR];
-            for (c, &x) in self.qkv[row..row + d].iter().enumerate() {
-                panel[c * MR + r % MR] = x * scale;
+        let start = (self.batch * self.shape.tokens + self.first) * 3 * width + self.head * d;
+        let mut longest = 0f32;
+        let panels = packed.chunks_exact_mut(d * MR).take(queries.div_ceil(MR));
+        for (i, panel) in panels.enumerate() {
+            // All rows at a time: they lie far apart, and their misses overlap.
+            let rows: [&[f32]; MR] =
+                std::array::from_fn(|r| &self.qkv[start + (i * MR + r).min(queries - 1) * 3 * width..][..d]);
+            for (c, column) in panel.chunks_exact_mut(MR).enumerate() {
+                for r in 0..MR {
+                    column[r] = rows[r][c] * scale;
+                }
+            }
+            for row in rows {
+                longest = larger(longest, squares(row));
             }
         }
+        longest * scale * scale
     }
 }
 

@@ -19,10 +19,10 @@ use rayon::prelude::*;
 
 use super::Isa;
 use super::aligned::Aligned;
-use super::simd::{Kernel, Simd, dispatch};
+use super::simd::{Kernel, Simd, dispatch, prefetch};
 use crate::ops::Activation;
 use pack::{Depths, pack_columns, pack_rows};
-use tile::finish;
+use tile::{finish, finish_tile};
 
 pub use backward::{Mlp, MlpGradients, column_sums, mlp_backward, mlp_keeping, weight_gradient};
 pub use pack::PackedWeight;
@@ -32,6 +32,10 @@ pub(crate) use tile::tile;
 const BLOCK_ROWS: usize = 96;
 /// Columns of partial sums kept at a time (`96 x 512` floats are 192 KiB).
 const BLOCK_COLS: usize = 512;
+/// Floats of a cache line.
+const LINE_FLOATS: usize = 16;
+/// Depth up to which whole row panels are read where they lie: packing would cost as much as a good part of the products.
+const DIRECT_DEPTH: usize = 64;
 /// Tasks per thread that keep threads busy to the end.
 const TASKS_PER_THREAD: usize = 4;
 
@@ -56,7 +60,7 @@ struct Scratch {
 }
 
 #[derive(Default)]
-struct BlockScratch {
+pub(super) struct BlockScratch {
     packed: Aligned,
     partial: Aligned,
 }
@@ -94,14 +98,27 @@ impl Kernel for Block<'_> {
         let m = self.out.len() / n;
         let row_panels = m.div_ceil(MR);
         let packed = self.scratch.packed.at_least(row_panels * MR * k);
-        match self.x {
-            Rows::Lying(x) => pack_rows::<MR>(x, k, packed),
-            Rows::Standing { values, stride, first } => pack_columns::<MR>(values, stride, first, m, packed),
-        }
+        // Row panels that are not packed.
+        let direct = match self.x {
+            Rows::Lying(x) if k <= DIRECT_DEPTH => {
+                let whole = m / MR;
+                pack_rows::<MR>(&x[whole * MR * k..], k, &mut packed[whole * MR * k..]);
+                &x[..whole * MR * k]
+            }
+            Rows::Lying(x) => {
+                pack_rows::<MR>(x, k, packed);
+                &[]
+            }
+            Rows::Standing { values, stride, first } => {
+                pack_columns::<MR>(values, stride, first, m, packed);
+                &[]
+            }
+        };
         let weights = self.w.data.as_slice();
         let block_panels = BLOCK_COLS / nr;
-        let partial = self.scratch.partial.at_least(row_panels * MR * n.div_ceil(nr).min(block_panels) * nr);
         let depths = Depths::new(self.w.isa, k);
+        let partial_panels = if depths.single() { 1 } else { n.div_ceil(nr).min(block_panels) };
+        let partial = self.scratch.partial.at_least(row_panels * MR * partial_panels * nr);
 
         let col_panels = n.div_ceil(nr);
         for first_panel in (0..col_panels).step_by(block_panels) {
@@ -110,10 +127,19 @@ impl Kernel for Block<'_> {
                 let last = at + depth == k;
                 for j in 0..panels {
                     let b = &weights[((first_panel + j) * k + at) * nr..][..depth * nr];
+                    // The next panel is fetched while this one is used: each tile asks for a part of it.
+                    let ahead = if j + 1 < panels { &weights[((first_panel + j + 1) * k + at) * nr..] } else { &[] };
+                    let ahead = &ahead[..ahead.len().min(depth * nr)];
+                    let part = (depth * nr).div_ceil(row_panels).next_multiple_of(LINE_FLOATS);
+                    let col = (first_panel + j) * nr;
+                    let width = nr.min(n - col);
                     for i in 0..row_panels {
                         let a = &packed[(i * k + at) * MR..][..depth * MR];
-                        let sums = &mut partial[(j * row_panels + i) * MR * nr..][..MR * nr];
+                        let sums = &mut partial[(j % partial_panels * row_panels + i) * MR * nr..][..MR * nr];
                         let mut acc = [[S::zero(); 2]; MR];
+                        for line in ahead.iter().skip(i * part).take(part).step_by(LINE_FLOATS) {
+                            prefetch(line);
+                        }
                         // SAFETY: `sums` has MR rows of two vectors; `a` has `depth * MR`, `b` `depth * 2 W` floats.
                         unsafe {
                             if at > 0 {
@@ -122,17 +148,36 @@ impl Kernel for Block<'_> {
                                     acc[r][1] = S::load(sums.as_ptr().add(r * nr + S::W));
                                 }
                             }
-                            acc = tile::<S, MR>(depth, a.as_ptr(), MR, 1, b.as_ptr(), acc);
-                            for r in 0..MR {
+                            acc = match direct.get(i * MR * k..(i + 1) * MR * k) {
+                                // Only for depths that are taken at once.
+                                Some(rows) => tile::<S, MR>(depth, rows.as_ptr(), 1, k, b.as_ptr(), acc),
+                                None => tile::<S, MR>(depth, a.as_ptr(), MR, 1, b.as_ptr(), acc),
+                            };
+                        }
+                        let rows = MR.min(m - i * MR);
+                        if last && width == nr {
+                            let bias = bias.map(|b| &b[col..col + nr]);
+                            let residual = residual.map(|x| &x[i * MR * n..]);
+                            finish_tile::<S, MR>(
+                                &acc,
+                                (rows, n, col),
+                                bias,
+                                act,
+                                residual,
+                                &mut self.out[i * MR * n..],
+                            );
+                            continue;
+                        }
+                        for r in 0..MR {
+                            // SAFETY: `sums` has MR rows of two vectors.
+                            unsafe {
                                 S::store(sums.as_mut_ptr().add(r * nr), acc[r][0]);
                                 S::store(sums.as_mut_ptr().add(r * nr + S::W), acc[r][1]);
                             }
                         }
                         if last {
-                            let rows = MR.min(m - i * MR);
                             for r in 0..rows {
-                                let (row, col) = (i * MR + r, (first_panel + j) * nr);
-                                let width = nr.min(n - col);
+                                let row = i * MR + r;
                                 let place = row * n + col..row * n + col + width;
                                 finish::<S>(
                                     &mut sums[r * nr..(r + 1) * nr],
@@ -160,7 +205,7 @@ fn check(x: &[f32], w: &PackedWeight, epilogue: &Epilogue<'_>, m: usize, out: us
 }
 
 /// Rows of a task: few enough that every thread gets several, at most a block.
-fn task_rows(isa: Isa, m: usize) -> usize {
+pub(super) fn task_rows(isa: Isa, m: usize) -> usize {
     m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(isa.tile_rows()).min(BLOCK_ROWS)
 }
 
@@ -189,6 +234,15 @@ pub fn linear(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, out: &mut [f3
             dispatch(w.isa, Block { scratch: &mut scratch.blocks, x: Rows::Lying(x), w, epilogue, out });
         });
     });
+}
+
+/// [`linear`] on this thread alone, any number of rows at once.
+pub(super) fn block(x: &[f32], w: &PackedWeight, epilogue: Epilogue<'_>, scratch: &mut BlockScratch, out: &mut [f32]) {
+    if w.n == 0 || out.is_empty() {
+        return;
+    }
+    check(x, w, &epilogue, out.len() / w.n, out.len());
+    dispatch(w.isa, Block { scratch, x: Rows::Lying(x), w, epilogue, out });
 }
 
 /// Two layers, `out = linear(linear(x, first), second)`, block of rows by block of rows: what lies between them, several

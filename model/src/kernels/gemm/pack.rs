@@ -17,6 +17,11 @@ impl Depths {
         Self { k, step: k.div_ceil(k.div_ceil(isa.panel_depth())) }
     }
 
+    /// Whether there is one slice.
+    pub(super) fn single(self) -> bool {
+        self.step == self.k
+    }
+
     pub(super) fn ranges(self) -> impl Iterator<Item = (usize, usize)> {
         (0..self.k).step_by(self.step).map(move |at| (at, self.step.min(self.k - at)))
     }

@@ -34,7 +34,53 @@ pub(crate) unsafe fn tile<S: Simd, const MR: usize>(
     acc
 }
 
-/// The epilogue on one tile row: `sums` has two whole vectors, the others as many columns as there are outputs.
+/// The epilogue on `rows` rows of a tile whose columns are all outputs, `col` being the first of `n`: from the registers to
+/// `out`. `residual` and `out` start at the tile's first row.
+#[inline(always)]
+pub(super) fn finish_tile<S: Simd, const MR: usize>(
+    acc: &[[S::V; 2]; MR],
+    (rows, n, col): (usize, usize, usize),
+    bias: Option<&[f32]>,
+    act: Activation,
+    residual: Option<&[f32]>,
+    out: &mut [f32],
+) {
+    let inside = (rows - 1) * n + col + 2 * S::W;
+    assert!(rows <= MR && col + 2 * S::W <= n && out.len() >= inside, "tile of {rows} rows");
+    assert!(bias.is_none_or(|b| b.len() == 2 * S::W) && residual.is_none_or(|r| r.len() >= inside), "epilogue");
+    // SAFETY: two vectors of bias, as just checked.
+    let bias = bias.map(|b| unsafe { [S::load(b.as_ptr()), S::load(b.as_ptr().add(S::W))] });
+    // A macro, not a closure (see `kernels::math`), and one loop per activation instead of a choice per vector.
+    macro_rules! rows {
+        (|$v:ident| $value:expr) => {
+            for r in 0..rows {
+                for half in 0..2 {
+                    let mut $v = acc[r][half];
+                    if let Some(bias) = bias {
+                        $v = S::add($v, bias[half]);
+                    }
+                    let mut value = $value;
+                    let at = r * n + col + half * S::W;
+                    // SAFETY: `at + W <= inside`, checked above.
+                    unsafe {
+                        if let Some(residual) = residual {
+                            value = S::add(value, S::load(residual.as_ptr().add(at)));
+                        }
+                        S::store(out.as_mut_ptr().add(at), value);
+                    }
+                }
+            }
+        };
+    }
+    match act {
+        Activation::None => rows!(|v| v),
+        Activation::Gelu => rows!(|v| activate::<S>(Activation::Gelu, v)),
+        Activation::Silu => rows!(|v| activate::<S>(Activation::Silu, v)),
+    }
+}
+
+/// The epilogue on one row of a tile that the outputs do not fill: `sums` has two whole vectors, the others as many
+/// columns as there are outputs.
 #[inline(always)]
 pub(super) fn finish<S: Simd>(
     sums: &mut [f32],
@@ -43,23 +89,6 @@ pub(super) fn finish<S: Simd>(
     residual: Option<&[f32]>,
     out: &mut [f32],
 ) {
-    if out.len() == 2 * S::W && sums.len() == out.len() {
-        for at in [0, S::W] {
-            // SAFETY: all four have two vectors' worth of floats.
-            unsafe {
-                let mut v = S::load(sums.as_ptr().add(at));
-                if let Some(bias) = bias {
-                    v = S::add(v, S::load(bias.as_ptr().add(at)));
-                }
-                v = activate::<S>(act, v);
-                if let Some(residual) = residual {
-                    v = S::add(v, S::load(residual.as_ptr().add(at)));
-                }
-                S::store(out.as_mut_ptr().add(at), v);
-            }
-        }
-        return;
-    }
     if let Some(bias) = bias {
         sums.iter_mut().zip(bias).for_each(|(s, b)| *s += b);
     }

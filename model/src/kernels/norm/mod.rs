@@ -53,9 +53,13 @@ impl Kernel for Rows<'_> {
             if let Some(statistics) = self.statistics.get_mut(row) {
                 *statistics = RowStatistics::new(mean, scale);
             }
-            for (o, &v) in out.iter_mut().zip(x) {
-                *o = ((f64::from(v) - mean) * scale) as f32;
+            let normal = |v: f32| ((f64::from(v) - mean) * scale) as f32;
+            if let (Some(weight), Some(bias)) = (self.weight, self.bias) {
+                let learned = weight.iter().zip(bias);
+                out.iter_mut().zip(x).zip(learned).for_each(|((o, &v), (w, b))| *o = normal(v) * w + b);
+                continue;
             }
+            out.iter_mut().zip(x).for_each(|(o, &v)| *o = normal(v));
             if let Some(weight) = self.weight {
                 out.iter_mut().zip(weight).for_each(|(o, w)| *o *= w);
             }
@@ -64,6 +68,17 @@ impl Kernel for Rows<'_> {
             }
         }
     }
+}
+
+/// [`layer_norm`] on this thread alone, for lengths that were checked.
+pub(super) fn rows(
+    isa: Isa,
+    x: &[f32],
+    width: usize,
+    (weight, bias, eps): (Option<&[f32]>, Option<&[f32]>, f64),
+    out: &mut [f32],
+) {
+    dispatch(isa, Rows { x, width, weight, bias, eps, out, statistics: &mut [] });
 }
 
 /// `(x - mean) / sqrt(variance + eps) * weight + bias` for each row of `width` values.

@@ -1,0 +1,85 @@
+//! Values in another order, and the Gaussian head's: kernels where they cover the tensors, else candle's own operations.
+
+use candle_core::{Result, Tensor};
+
+use crate::kernels::gaussians::{Input, Meaning, Output};
+use crate::kernels::tensors::{covered, tracked, with_all, with_values};
+use crate::kernels::{self, Isa};
+
+fn ready<'a>(tensors: impl IntoIterator<Item = &'a Tensor> + Clone) -> bool {
+    covered(tensors.clone()) && !tracked(tensors.clone()) && tensors.into_iter().all(|t| t.elem_count() > 0)
+}
+
+/// Pictures `(views, 3, h, w)` and ray planes `(views, c, h, w)` to patches `(views rows cols, (3 + c) p p)`.
+pub(crate) fn patches(image: &Tensor, planes: &Tensor, p: usize) -> Result<Tensor> {
+    let (views, a, h, w) = image.dims4()?;
+    let (_, b, _, _) = planes.dims4()?;
+    let (rows, cols, channels) = (h / p, w / p, a + b);
+    if planes.dims() != [views, b, h, w] || rows * p != h || cols * p != w {
+        candle_core::bail!("patches of {p}: picture {:?}, planes {:?}", image.dims(), planes.dims());
+    }
+    let shape = (views * rows * cols, channels * p * p);
+    if !ready([image, planes]) {
+        return Tensor::cat(&[image, planes], 1)?
+            .reshape(vec![views, channels, rows, p, cols, p])?
+            .permute(vec![0, 2, 4, 1, 3, 5])?
+            .contiguous()?
+            .reshape(shape);
+    }
+    let mut out = vec![0f32; shape.0 * shape.1];
+    with_all([image, planes], |[image, planes]| {
+        kernels::arrange::patches(&[(image, a), (planes, b)], [views, h, w], p, &mut out);
+        Ok(())
+    })?;
+    Tensor::from_vec(out, shape, image.device())
+}
+
+/// `(n rows cols 4^levels, c)`, each of the `n` pictures in nested order, to `(n, rows 2^levels, cols 2^levels, c)`.
+pub(crate) fn unnest(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<Tensor> {
+    let (all, c) = x.dims2()?;
+    let side = 1 << levels;
+    let pictures = all / (grid.0 * grid.1 * side * side).max(1);
+    let result = (pictures, grid.0 * side, grid.1 * side, c);
+    if ready([x]) && pictures * grid.0 * grid.1 * side * side == all {
+        let mut out = vec![0f32; x.elem_count()];
+        with_values(x, |x| {
+            kernels::arrange::unnest(x, c, grid, levels, &mut out);
+            Ok(())
+        })?;
+        return Tensor::from_vec(out, result, x.device());
+    }
+    let mut shape = vec![pictures, grid.0, grid.1];
+    shape.extend(std::iter::repeat_n(2, 2 * levels));
+    shape.push(c);
+    // Axes: picture, row, col, then (row bit, col bit) per level, coarse to fine.
+    let rows = std::iter::once(1).chain((0..levels).map(|k| 3 + 2 * k));
+    let cols = std::iter::once(2).chain((0..levels).map(|k| 4 + 2 * k));
+    let axes: Vec<usize> = std::iter::once(0).chain(rows).chain(cols).chain(std::iter::once(3 + 2 * levels)).collect();
+    x.reshape(shape)?.permute(axes)?.contiguous()?.reshape(result)
+}
+
+/// Means, scales, quaternions, opacities, colours and depths of the Gaussian head's raw numbers, each `(views h w, channels)`
+/// flat; none where the kernel does not cover the tensors.
+pub(crate) fn gaussians(
+    meaning: &Meaning,
+    [raw, image, origins, directions]: [&Tensor; 4],
+    dims: [usize; 3],
+) -> Result<Option<[Vec<f32>; 6]>> {
+    if !ready([raw, image, origins, directions]) {
+        return Ok(None);
+    }
+    let pixels: usize = dims.iter().product();
+    let mut out = [3, 3, 4, 1, 3, 1].map(|channels| vec![0f32; channels * pixels]);
+    let [means, scales, quats, opacities, colors, depths] = &mut out;
+    with_all([raw, image, origins, directions], |[raw, image, origins, directions]| {
+        let input = Input { raw, image, origins, directions, dims };
+        kernels::gaussians::gaussians(
+            Isa::detect(),
+            meaning,
+            &input,
+            Output { means, scales, quats, opacities, colors, depths },
+        );
+        Ok(())
+    })?;
+    Ok(Some(out))
+}
