@@ -105,13 +105,8 @@ impl Rays {
                     planes[(3 + i) * pixels + pixel] = T::from_f64(u[i]);
                 }
             }
-<<<<<<< HEAD
-        }
-        let (device, dtype): (&Device, DType) = (batch.image.device(), batch.image.dtype());
-=======
         });
-        let device: &Device = batch.image.device();
->>>>>>> 0f248b2f864a48f38ae438ad7b18ad1d942e820b
+        let (device, dtype): (&Device, DType) = (batch.image.device(), batch.image.dtype());
         Ok(Self {
             origins: Tensor::from_vec(origins, (b, t, v, 1, 1, 3), device)?.to_dtype(dtype)?,
             directions: Tensor::from_vec(directions, (b, t, v, h, w, 3), device)?.to_dtype(dtype)?,
