@@ -1,6 +1,5 @@
 //! Camera rays: the part of the input that carries 3D (paper section 3.1, "Network and input").
 
-
 use crate::clip::ClipBatch;
 use crate::config::{DepthMeaning, ModelConfig, RayPixelOffset};
 use crate::error::ModelError;
@@ -89,8 +88,6 @@ impl Rays {
             let rotation = [0, 1, 2].map(|i| [m[4 * i], m[4 * i + 1], m[4 * i + 2]]);
             let camera = RayCamera::new([k[0], k[4], k[2], k[5]], rotation, offset);
             let o = [m[3], m[7], m[11]];
-        });
-        let (device, dtype): (&Device, DType) = (batch.image.device(), batch.image.dtype());
             for pixel in 0..pixels {
                 let d = camera.direction(pixel / w, pixel % w);
                 let u = unit(d);
