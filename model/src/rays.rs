@@ -1,6 +1,8 @@
 //! Camera rays: the part of the input that carries 3D (paper section 3.1, "Network and input").
 
-use crate::clip::ClipBatch;
+use candle_core::{DType, Device, Tensor, WithDType};
+use rayon::prelude::*;
+
 use crate::config::{DepthMeaning, ModelConfig, RayPixelOffset};
 use crate::error::ModelError;
 
