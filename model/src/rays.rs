@@ -3,6 +3,7 @@
 use candle_core::{DType, Device, Tensor, WithDType};
 use rayon::prelude::*;
 
+use crate::clip::ClipBatch;
 use crate::config::{DepthMeaning, ModelConfig, RayPixelOffset};
 use crate::error::ModelError;
 
