@@ -19,6 +19,8 @@ impl Config {
         between("window.hop_sec", window.hop_sec, 0.0, 60.0)?;
         between("window.stride_tolerance", window.stride_tolerance, 0.0, 0.5)?;
         between("window.timespan_sec", window.timespan_sec, 1e-3, 600.0)?;
+        between("overlap.depth_gate", self.overlap.depth_gate, 0.0, 1.0)?;
+        between("overlap.max_color_step", self.overlap.max_color_step, 0.0, 1.0)?;
         between("map.tile_m", self.map.tile_m, 1.0, 1000.0)?;
         // A tile's voxels are numbered with so many bits.
         let finest = self.map.tile_m / f64::from(crate::map::MAX_PER_EDGE);

@@ -4,6 +4,8 @@ pub mod evaluate;
 pub mod figures;
 pub mod score;
 pub mod select;
+#[cfg(test)]
+mod tests;
 pub mod truth;
 
 use std::path::Path;
@@ -146,6 +148,27 @@ impl Engine {
 
     /// Runs the network on one window: Gaussians in the window's anchor frame, sky and exposure.
     pub fn step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
+        let mut scenes = self.steps(&[window], cameras)?;
+        scenes.pop().context("the network gave no scene")?
+    }
+
+    /// Runs the network on several windows in one forward pass. One result per window: a window whose result is not
+    /// finite does not spoil the others.
+    ///
+    /// # Errors
+    /// Windows whose shapes differ or that the network does not take.
+    pub fn steps(&mut self, windows: &[&Window<Frame>], cameras: &[Intrinsics]) -> Result<Vec<Result<Scene>>> {
+        let clips = windows.iter().map(|w| self.clip(w, cameras)).collect::<Result<Vec<_>>>()?;
+        let output = match clips.as_slice() {
+            [] => return Ok(Vec::new()),
+            [one] => self.model.forward(one)?,
+            several => self.model.forward(&ClipBatch::stack(several)?)?,
+        };
+        Ok((0..clips.len()).map(|i| Ok(output.scene(i)?)).collect())
+    }
+
+    /// One window as the network takes it.
+    fn clip(&self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<ClipBatch> {
         let pictures: Vec<Vec<Vec<f32>>> = window
             .steps
             .iter()
@@ -162,8 +185,7 @@ impl Engine {
                 (0..cameras.len().min(pictures[t].len())).map(view).collect()
             })
             .collect();
-        let batch = ClipBatch::from_views(&views, PixelLayout::Hwc, self.timespan_sec, &self.device)?;
-        Ok(self.model.forward(&batch)?.scene(0)?)
+        Ok(ClipBatch::from_views(&views, PixelLayout::Hwc, self.timespan_sec, &self.device)?)
     }
 
     /// Draws a scene: `targets` are camera index (for its exposure) and view in the anchor frame.
