@@ -1,22 +1,26 @@
 //! Gaussians read back from a results folder: the map, or one step.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec3, Quat, Vec3};
 
 use crate::bag::Bag;
 use crate::cdr::decode as cdr;
 use crate::msg::PointCloud2;
+use crate::output::objects_csv::{OBJECTS_FOLDER, read_objects};
 use crate::output::ply::{PlyCloud, read_ply};
 use crate::pipeline::sink::{ANCHOR_FRAME, PREFIX};
 use crate::rigid::Rigid;
+use crate::sync::clock::seconds_between;
 
 /// ROS data type codes of the columns read.
 const FLOAT32: u8 = 7;
 const UINT16: u8 = 4;
 
 /// Gaussians in a local frame, and where that frame lies.
+#[derive(Clone)]
 pub struct SavedGaussians {
     /// The Gaussians.
     pub cloud: PlyCloud,
@@ -26,6 +30,82 @@ pub struct SavedGaussians {
     pub motion_ids: Vec<u16>,
     /// The local frame in the map frame.
     pub map_from_local: Rigid,
+}
+
+/// A moving object: its own Gaussians, and where it was.
+pub struct SavedObject {
+    /// Its Gaussians, in the frame of its box.
+    pub cloud: PlyCloud,
+    /// Stamp and map_from_box, oldest first.
+    poses: Vec<(i64, Rigid)>,
+}
+
+impl SavedObject {
+    /// map_from_box at a stamp; none before it was first and after it was last seen.
+    pub fn pose_at(&self, stamp_ns: i64) -> Option<Rigid> {
+        let after = self.poses.partition_point(|p| p.0 < stamp_ns);
+        let (b_ns, b) = self.poses.get(after)?;
+        if *b_ns == stamp_ns {
+            return Some(*b);
+        }
+        let (a_ns, a) = self.poses.get(after.checked_sub(1)?)?;
+        Some(a.interpolate(b, seconds_between(*a_ns, stamp_ns) / seconds_between(*a_ns, *b_ns)))
+    }
+}
+
+/// Reads the moving objects of a results folder: `objects.csv` and `objects/`.
+///
+/// # Errors
+/// Files that are missing or cannot be read.
+pub fn load_objects(folder: &Path) -> Result<Vec<SavedObject>> {
+    let mut poses: BTreeMap<u32, Vec<(i64, Rigid)>> = BTreeMap::new();
+    for row in read_objects(&folder.join("objects.csv"))? {
+        poses.entry(row.id).or_default().push((row.stamp_ns, row.map_from_box));
+    }
+    let gaussians = folder.join(OBJECTS_FOLDER);
+    let mut objects = Vec::new();
+    for (id, mut poses) in poses {
+        poses.sort_by_key(|p| p.0);
+        poses.dedup_by_key(|p| p.0);
+        let file = gaussians.join(format!("{id}.ply"));
+        if file.exists() {
+            objects.push(SavedObject { cloud: read_ply(&file)?.cloud, poses });
+        }
+    }
+    Ok(objects)
+}
+
+impl SavedGaussians {
+    /// Adds an object's Gaussians where `map_from_box` says, at rest.
+    pub fn add(&mut self, cloud: &PlyCloud, map_from_box: &Rigid) {
+        let local_from_box = crate::window::relative(&self.map_from_local, map_from_box);
+        let turn = local_from_box.rotation.as_quat();
+        for i in 0..cloud.len() {
+            let p = local_from_box.apply(Vec3::from(cloud.positions[i]).as_dvec3());
+            let [w, x, y, z] = cloud.quats[i];
+            let q = turn * Quat::from_xyzw(x, y, z, w);
+            self.cloud.positions.push(p.as_vec3().to_array());
+            self.cloud.quats.push([q.w, q.x, q.y, q.z]);
+        }
+        self.cloud.colors01.extend_from_slice(&cloud.colors01);
+        self.cloud.opacities.extend_from_slice(&cloud.opacities);
+        self.cloud.scales.extend_from_slice(&cloud.scales);
+    }
+
+    /// Keeps the Gaussians that `keep` says, by number.
+    pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
+        let kept: Vec<usize> = (0..self.cloud.len()).filter(|&i| keep(i)).collect();
+        fn pick<T: Copy>(from: &mut Vec<T>, kept: &[usize]) {
+            *from = kept.iter().filter_map(|&i| from.get(i).copied()).collect();
+        }
+        let c = &mut self.cloud;
+        for column in [&mut c.positions, &mut c.colors01, &mut c.scales, &mut self.velocities] {
+            pick(column, &kept);
+        }
+        pick(&mut c.opacities, &kept);
+        pick(&mut c.quats, &kept);
+        pick(&mut self.motion_ids, &kept);
+    }
 }
 
 /// Reads `map.ply`.

@@ -17,6 +17,7 @@ use super::{Outcome, UsageError, progress_bar};
 use crate::config::{Config, ModelConfigSection};
 use crate::engine::score::{Scorer, Scores};
 use crate::engine::{Engine, ModelSource, views_of};
+use crate::overlap::Agreement;
 use crate::pipeline::step::{Step, newest_time_sec};
 use crate::pipeline::timing::{StageStats, Timings, peak_rss_mb, reset_peak_rss};
 use crate::source::world::{first_window, posed_set, truth_images};
@@ -179,7 +180,8 @@ pub(super) fn time_network(name: &str, section: &ModelConfigSection, runs: usize
     let peak_rss_mb = peak_rss_mb();
     let (scene, views) = last.context("no run")?;
     let gaussians = scene.gaussians.len();
-    let step = Step { index: 0, window, scene: Arc::new(scene), views, total_ms: 0.0 };
+    let agreement = Agreement::default();
+    let step = Step { index: 0, window, scene: Arc::new(scene), views, agreement, total_ms: 0.0 };
     let scores = score(engine.raster_settings(), step, &drive, &cameras)?;
     Ok(Setting {
         model: name.into(),

@@ -36,5 +36,5 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         bar.set_position(done);
     })?;
     bar.finish_and_clear();
-    run_into(&bag, &out, config, progress)
+    run_into(&bag, &out, config, 1, progress)
 }

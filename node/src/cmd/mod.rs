@@ -7,6 +7,7 @@ mod eval;
 mod info;
 mod interrupt;
 mod map;
+mod refine;
 mod render;
 mod replay;
 mod soak;
@@ -78,6 +79,8 @@ enum Command {
     Render(render::Args),
     /// Check a saved map, say what it holds, write it as PLY.
     Map(map::Args),
+    /// Sharpen a saved map by per-scene optimisation on a bag's pictures.
+    Refine(refine::Args),
     /// Say what a bag holds and how it would be used.
     Info(info::Args),
     /// Error figures on procedural drives that training never sees, beside simple baselines.
@@ -105,6 +108,7 @@ impl Cli {
             Command::Synth(a) => synth::run(&a, progress),
             Command::Render(a) => render::run(&a),
             Command::Map(a) => map::run(&a),
+            Command::Refine(a) => refine::run(&a, progress),
             Command::Info(a) => info::run(&a),
             Command::Eval(a) => eval::run(&a, progress),
             Command::Train(a) => train::run(&a, progress),
@@ -119,6 +123,13 @@ impl Cli {
             if usage { Outcome::Usage } else { Outcome::Input }
         })
     }
+}
+
+/// WIDTHxHEIGHT, both above 0.
+fn parse_size(name: &str, text: &str) -> Result<(usize, usize), UsageError> {
+    let number = |part: &str| part.parse().ok().filter(|n| *n > 0);
+    let both = text.split_once('x').and_then(|(w, h)| Some((number(w)?, number(h)?)));
+    both.ok_or_else(|| UsageError(format!("{name} '{text}' is not WIDTHxHEIGHT")))
 }
 
 fn start_log(quiet: bool) {

@@ -1,5 +1,6 @@
 //! `storm render`: a saved map, or one step of a replay, from any pose at any time.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -14,7 +15,7 @@ use crate::output::picture::{
 };
 use crate::output::tum::read_tum;
 use crate::rigid::Rigid;
-use crate::saved::{self, SavedGaussians};
+use crate::saved::{self, SavedGaussians, SavedObject};
 
 /// Coverage from which a pixel shows a surface.
 const SURFACE_ALPHA: f32 = 0.5;
@@ -48,6 +49,13 @@ pub struct Args {
     /// What to draw.
     #[arg(long, default_value = "color")]
     what: What,
+    /// Moving things. Of a results folder's map they are its objects, drawn where they were at the time of each pose of
+    /// --trajectory, or at --at; of a step (--step) they are its fast Gaussians. [default: remove for a map, keep for a step]
+    #[arg(long)]
+    objects: Option<Objects>,
+    /// With --objects and --pose: seconds after the recording's first pose (trajectory.tum).
+    #[arg(long, requires = "objects", allow_hyphen_values = true)]
+    at: Option<f64>,
     /// What draws: cpu, or wgpu (any GPU; a build with --features wgpu).
     #[arg(long, default_value = "cpu", value_parser = ["cpu", "wgpu"])]
     device: String,
@@ -74,6 +82,16 @@ enum What {
     Mask,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Objects {
+    /// Everything: what stands, and what moves where it was.
+    Keep,
+    /// What stands alone.
+    Remove,
+    /// What moves alone.
+    Only,
+}
+
 fn parse_pose(text: &str) -> Result<Rigid, String> {
     let wrong = || format!("'{text}' is not X,Y,Z,YAW[,PITCH] or X,Y,Z,QW,QX,QY,QZ with finite numbers");
     let n: Vec<f64> = text.split(',').map(|p| p.trim().parse().unwrap_or(f64::NAN)).collect();
@@ -95,29 +113,38 @@ pub fn run(args: &Args) -> Result<Outcome> {
         return Err(UsageError(format!("--fov {}: wants 1 to 170 degrees", args.fov)).into());
     }
     let saved = load(&args.map, args.step)?;
+    let scene = Scenery::new(args, saved)?;
     let intrinsics = Intrinsics::from_fov(args.fov, args.width, args.height);
     let mut raster = renderer(&args.device)?;
     tracing::info!("drawing on {}", raster.describe());
-    let (loaded, channels) = load_splats(&mut *raster, &saved, args.what)?;
-    let mut one = |pose: &Rigid, out: &Path| -> Result<bool> {
+    let mut ready = None;
+    let mut one = |pose: &Rigid, stamp_ns: Option<i64>, out: &Path| -> Result<bool> {
+        let saved = scene.at(stamp_ns);
+        // Loaded once, or anew where things move between pictures.
+        let (loaded, channels) = match ready.take_if(|_| scene.objects.is_empty()) {
+            Some(known) => known,
+            None => load_splats(&mut *raster, &saved, args.what)?,
+        };
         let local_from_camera = saved.map_from_local.inverse() * *pose * crate::window::camera_from_flu().inverse();
         let view = View::from_pose(local_from_camera.to_f32(), intrinsics);
         let pictures = raster.draw(loaded, args.time, &channels, std::slice::from_ref(&view))?;
+        ready = Some((loaded, channels));
         let picture = pictures.into_iter().next().context("the rasteriser gave no picture")?;
         finish(&picture, args.what)?.write_png(out).with_context(|| format!("cannot write {}", out.display()))?;
         Ok(picture.alpha.iter().any(|&a| a > 0.0))
     };
     let mut seen = false;
     if let Some(pose) = &args.pose {
-        seen = one(pose, &args.out)?;
+        seen = one(pose, None, &args.out)?;
     }
     if let Some(file) = &args.trajectory {
         std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
         let up = Rigid::new(DQuat::IDENTITY, DVec3::new(0.0, 0.0, args.height_m));
-        for (i, (_, pose)) in read_tum(file)?.iter().enumerate() {
-            seen |= one(&(*pose * up), &args.out.join(format!("{i:06}.png")))?;
+        for (i, (stamp_ns, pose)) in read_tum(file)?.iter().enumerate() {
+            seen |= one(&(*pose * up), Some(*stamp_ns), &args.out.join(format!("{i:06}.png")))?;
         }
     }
+    let saved = &scene.still;
     if !seen {
         tracing::warn!(
             "nothing is in view from there; the map's own position is {:?}",
@@ -126,6 +153,57 @@ pub fn run(args: &Args) -> Result<Outcome> {
     }
     println!("{}", args.out.display());
     Ok(Outcome::Done)
+}
+
+/// What stands and what moves, put together for each picture.
+struct Scenery {
+    still: SavedGaussians,
+    objects: Vec<SavedObject>,
+    /// For poses without a time of their own, nanoseconds.
+    stamp_ns: i64,
+}
+
+impl Scenery {
+    fn new(args: &Args, mut saved: SavedGaussians) -> Result<Self> {
+        let of_step = !saved.velocities.is_empty();
+        let moves = |v: &[f32; 3]| Vec3::from(*v).length() >= MOVING_MPS;
+        let moving: Vec<bool> = saved.velocities.iter().map(moves).collect();
+        let (mut objects, mut stamp_ns) = (Vec::new(), 0);
+        match args.objects {
+            Some(Objects::Remove) if of_step => saved.retain(|i| !moving[i]),
+            Some(Objects::Only) if of_step => saved.retain(|i| moving[i]),
+            Some(Objects::Keep | Objects::Only) if !of_step => {
+                if !args.map.is_dir() {
+                    let text = format!("--objects needs a results folder, {} is a file", args.map.display());
+                    return Err(UsageError(text).into());
+                }
+                objects = saved::load_objects(&args.map)?;
+                if args.pose.is_some() {
+                    let at = args.at.ok_or_else(|| UsageError("--objects with --pose needs --at SECONDS".into()))?;
+                    let poses = read_tum(&args.map.join("trajectory.tum"))?;
+                    let (first_ns, _) = poses.first().context("trajectory.tum holds no pose")?;
+                    stamp_ns = first_ns.saturating_add(crate::sync::clock::signed_ns(at));
+                }
+                if args.objects == Some(Objects::Only) {
+                    saved.retain(|_| false);
+                }
+            }
+            _ => {}
+        }
+        Ok(Self { still: saved, objects, stamp_ns })
+    }
+
+    /// Everything there is at a time.
+    fn at(&self, stamp_ns: Option<i64>) -> Cow<'_, SavedGaussians> {
+        let stamp_ns = stamp_ns.unwrap_or(self.stamp_ns);
+        let mut here = self.objects.iter().filter_map(|o| Some((o, o.pose_at(stamp_ns)?))).peekable();
+        if here.peek().is_none() {
+            return Cow::Borrowed(&self.still);
+        }
+        let mut all = self.still.clone();
+        here.for_each(|(object, pose)| all.add(&object.cloud, &pose));
+        Cow::Owned(all)
+    }
 }
 
 fn renderer(device: &str) -> Result<Box<dyn Renderer>> {

@@ -15,6 +15,9 @@ pub struct Args {
     bag: PathBuf,
     #[command(flatten)]
     common: Common,
+    /// Windows that go through the network in one forward pass; the results are those of one by one, memory grows.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    batch: u16,
 }
 
 /// Arguments that `replay` and `demo` share.
@@ -40,13 +43,7 @@ pub struct Common {
 impl Common {
     /// The configuration: file, then overrides, then flags.
     pub fn config(&self) -> Result<Config> {
-        let mut config = match &self.config {
-            Some(path) => Config::load(path)?,
-            None => Config::default(),
-        };
-        for assignment in &self.set {
-            config = config.with_override(assignment)?;
-        }
+        let mut config = Config::from_arguments(self.config.as_deref(), &self.set)?;
         if let Some(weights) = &self.weights {
             config.model.weights = weights.display().to_string();
         }
@@ -61,11 +58,11 @@ impl Common {
 /// Replays the bag.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let out = args.common.out.clone().unwrap_or_else(|| default_out(&args.bag));
-    run_into(&args.bag, &out, args.common.config()?, progress)
+    run_into(&args.bag, &out, args.common.config()?, usize::from(args.batch), progress)
 }
 
-/// Replays `bag` into `out` and prints what came of it.
-pub(super) fn run_into(bag: &Path, out: &Path, config: Config, progress: bool) -> Result<Outcome> {
+/// Replays `bag` into `out`, `batch` windows at a time, and prints what came of it.
+pub(super) fn run_into(bag: &Path, out: &Path, config: Config, batch: usize, progress: bool) -> Result<Outcome> {
     if out.exists() && !out.is_dir() {
         return Err(UsageError(format!("--out {} is a file; give a folder", out.display())).into());
     }
@@ -74,8 +71,8 @@ pub(super) fn run_into(bag: &Path, out: &Path, config: Config, progress: bool) -
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.model.threads).build_global();
     }
     let bar = progress_bar(progress, 0, "replaying");
-    let options =
-        ReplayOptions { bag: bag.to_path_buf(), out: out.to_path_buf(), config, stop: super::interrupt::stop_flag() };
+    let stop = super::interrupt::stop_flag();
+    let options = ReplayOptions { bag: bag.to_path_buf(), out: out.to_path_buf(), config, batch, stop };
     let metrics = replay::run(&options, &|done, total| {
         bar.set_length(total);
         bar.set_position(done);

@@ -36,6 +36,9 @@ pub struct Args {
     /// Chance that a road user is taken for standing, per picture.
     #[arg(long, default_value_t = 0.0)]
     missed: f64,
+    /// Part of the ego motion that is taken for the scene's, standard deviation over windows.
+    #[arg(long, default_value_t = 0.0)]
+    ego_leak: f64,
     /// Only times and memory: no pictures, surfaces and ghosts.
     #[arg(long)]
     no_quality: bool,
@@ -58,17 +61,8 @@ pub struct Args {
 
 /// Drives, prints the figures.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
-    let wrong = || UsageError(format!("--size '{}' is not WIDTHxHEIGHT", args.size));
-    let (width, height) = args.size.split_once('x').ok_or_else(wrong)?;
-    let (width, height) = (width.parse().map_err(|_| wrong())?, height.parse().map_err(|_| wrong())?);
-    let mut config = match &args.config {
-        Some(path) => Config::load(path)?,
-        None => Config::default(),
-    };
-    for assignment in &args.set {
-        config = config.with_override(assignment)?;
-    }
-    config.validate()?;
+    let (width, height) = super::parse_size("--size", &args.size)?;
+    let config = Config::from_arguments(args.config.as_deref(), &args.set)?;
     let drive = DriveOptions {
         seed: args.seed,
         seconds: args.seconds,
@@ -82,7 +76,12 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         ..DriveOptions::default()
     };
     drive.check().map_err(|e| UsageError(e.to_string()))?;
-    let errors = OracleErrors { depth: args.depth_error, velocity_mps: args.velocity_error, missed: args.missed };
+    let errors = OracleErrors {
+        depth: args.depth_error,
+        velocity_mps: args.velocity_error,
+        missed: args.missed,
+        ego_leak: args.ego_leak,
+    };
     let temporary = tempfile::tempdir().context("no temporary folder")?;
     let map_dir = args.map.clone().unwrap_or_else(|| temporary.path().to_path_buf());
     let options = SoakOptions { drive, errors, quality: !args.no_quality, map_dir: Some(map_dir), config };
@@ -103,7 +102,9 @@ fn print(r: &SoakReport) {
         "seed {}: {:.0} s, {:.0} m, {} windows of {} Gaussians, {} threads",
         r.seed, r.seconds, r.metres, r.steps, r.gaussians, r.threads
     );
-    for (name, t) in [("fuse", &r.fuse_ms), ("tracks", &r.track_ms), ("objects", &r.object_ms)] {
+    for (name, t) in
+        [("fuse", &r.fuse_ms), ("overlap", &r.overlap_ms), ("tracks", &r.track_ms), ("objects", &r.object_ms)]
+    {
         println!(
             "{name:8} p50 {:.1} ms, p99 {:.1} ms; processor time p50 {:.1} ms, p99 {:.1} ms",
             t.p50, t.p99, t.cpu_p50, t.cpu_p99
@@ -119,6 +120,29 @@ fn print(r: &SoakReport) {
             q.rss_mb[0],
             q.rss_mb[1],
             q.map_gaussians[0]
+        );
+    }
+    let g = &r.growth;
+    println!(
+        "last quarter against the second: resident {:+.1} %, step p99 {:+.1} %, its processor time {:+.1} %",
+        100.0 * g.resident,
+        100.0 * g.step_p99,
+        100.0 * g.step_cpu_p99
+    );
+    for (i, m) in r.quarters.iter().map(|q| &q.memory_mb).enumerate() {
+        println!(
+            "memory after quarter {}: resident {:.1} MB, allocated {:.1} (unused {:.1}): tiles {:.1}, their index {:.2}, tracks {:.2}, objects {:.2}, overlap {:.1}, sets {:.1}, measurements {:.2}",
+            i + 1,
+            m.resident,
+            m.allocated,
+            m.unused,
+            m.tiles,
+            m.map_side,
+            m.tracks,
+            m.objects,
+            m.overlap,
+            m.sets,
+            m.measurements
         );
     }
     println!(
@@ -144,12 +168,22 @@ fn print(r: &SoakReport) {
             q.ghost_gaussians.map_or("-".into(), |x| format!("{x:.5}"))
         );
     }
+    if let Some(m) = &r.motion_quality {
+        for (name, s) in [("as given", &m.before), ("after overlap", &m.after)] {
+            println!(
+                "{name:14} of standing pixels {:.4} are said to move ({:.3} m/s on average), of moving ones {:.4} (speed off by {:.3} m/s)",
+                s.still_moving, s.still_error_mps, s.moving_kept, s.moving_error_mps
+            );
+        }
+    }
     if let Some(o) = &r.object_quality {
         println!(
-            "objects  ARI {}, moving pixels covered {}, velocity off by {} m/s; {} road users, {:.2} objects and {:.2} switches each",
+            "objects  ARI {}, moving pixels covered {}, velocity off by {} m/s, acceleration by {} m/s^2 ({} if said to be 0); {} road users, {:.2} objects and {:.2} switches each",
             show(o.fg_ari),
             show(o.covered),
             show(o.velocity_error_mps),
+            show(o.acceleration_error_mps2),
+            show(o.no_acceleration_error_mps2),
             o.road_users,
             o.objects_each,
             o.switches_each
@@ -160,7 +194,9 @@ fn print(r: &SoakReport) {
             "{} trajectories on road users ({} astray, {:.1} each), {:.2} s long on average; {} switched; velocity off by {:.3} m/s",
             t.judged, t.astray, t.per_mover, t.mean_life_sec, t.switches, t.velocity_error_mps
         );
-        for (name, s) in [("chained", &t.tracks), ("constant velocity", &t.constant_velocity)] {
+        for (name, s) in
+            [("chained", &t.tracks), ("constant velocity", &t.constant_velocity), ("true flow", &t.oracle_flow)]
+        {
             println!("{name:18} APD3D {}, OA {}", show(s.apd3d), show(s.occlusion_accuracy));
         }
     }

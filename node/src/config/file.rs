@@ -63,6 +63,19 @@ impl Config {
         Ok(config)
     }
 
+    /// From a command line: a file, if there is one, with single keys changed.
+    pub fn from_arguments(file: Option<&Path>, assignments: &[String]) -> Result<Self, ConfigError> {
+        let mut config = match file {
+            Some(path) => Self::load(path)?,
+            None => Self::default(),
+        };
+        for assignment in assignments {
+            config = config.with_override(assignment)?;
+        }
+        config.validate()?;
+        Ok(config)
+    }
+
     /// This configuration with one key changed: `section.key=value`, the value as YAML.
     pub fn with_override(&self, assignment: &str) -> Result<Self, ConfigError> {
         let wrong = |message: String| ConfigError::Parse { path: format!("--set {assignment}"), message };

@@ -124,6 +124,18 @@ section! {
 }
 
 section! {
+    /// What overlapping windows say of each other.
+    pub struct OverlapConfig {
+        /// Whether the velocity of surfaces is taken away that the window's other pictures show standing where they are.
+        enabled: bool = true,
+        /// Depths in two pictures are the same surface when they differ by less than this part of the depth; more where the network's own predictions of one pixel differ by more.
+        depth_gate: f64 = 0.03,
+        /// Largest difference of colour (root mean square over the channels, 0 to 1) between two looks at one surface.
+        max_color_step: f64 = 0.2,
+    }
+}
+
+section! {
     /// The long-horizon map.
     pub struct MapConfig {
         /// Edge of the tiles the map is kept, put to disk and published in, metres.
@@ -152,6 +164,8 @@ section! {
         max_disk_mb: usize = 16_384,
         /// The map is saved this often, seconds; a killed run loses at most that much. 0: only at the end.
         save_every_sec: f64 = 10.0,
+        /// Whether a save waits until it is on the disk itself, so that it outlives a loss of power too (a killed run needs no waiting).
+        sync: bool = true,
         /// Folder of a saved map (`map/` of a results folder) to go on from; it is copied, not changed. Empty: start anew.
         load: String = String::new(),
         /// Most Gaussians in map.ply and the published map; a larger map is thinned out evenly there, never in `map/`. 0: no limit.
@@ -241,6 +255,8 @@ pub struct Config {
     pub model: ModelConfigSection,
     /// Skipping what a scene does not need.
     pub skip: SkipConfig,
+    /// What overlapping windows say of each other.
+    pub overlap: OverlapConfig,
     /// The long-horizon map.
     pub map: MapConfig,
     /// Point trajectories.
@@ -260,6 +276,7 @@ impl Config {
         docs.extend(WindowConfig::describe("window"));
         docs.extend(ModelConfigSection::describe("model"));
         docs.extend(SkipConfig::describe("skip"));
+        docs.extend(OverlapConfig::describe("overlap"));
         docs.extend(MapConfig::describe("map"));
         docs.extend(TracksConfig::describe("tracks"));
         docs.extend(ObjectsConfig::describe("objects"));

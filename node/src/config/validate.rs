@@ -28,6 +28,8 @@ impl Config {
         between("skip.max_psnr_loss_db", self.skip.max_psnr_loss_db, 0.0, 100.0)?;
         between("skip.max_flow_change", self.skip.max_flow_change, 0.0, 100.0)?;
         between("skip.max_mask_change", self.skip.max_mask_change, 0.0, 1.0)?;
+        between("overlap.depth_gate", self.overlap.depth_gate, 0.0, 1.0)?;
+        between("overlap.max_color_step", self.overlap.max_color_step, 0.0, 1.0)?;
         between("map.tile_m", self.map.tile_m, 1.0, 1000.0)?;
         // A tile's voxels are numbered with so many bits.
         let finest = self.map.tile_m / f64::from(crate::map::MAX_PER_EDGE);

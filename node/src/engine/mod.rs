@@ -4,6 +4,8 @@ pub mod evaluate;
 pub mod figures;
 pub mod score;
 pub mod select;
+#[cfg(test)]
+mod tests;
 pub mod truth;
 
 use std::path::Path;
@@ -148,11 +150,27 @@ impl Engine {
 
     /// Runs the network on one window: Gaussians in the window's anchor frame, sky and exposure.
     pub fn step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
-        Ok(self.model.forward(&self.batch(window, cameras)?)?.scene(0)?)
+        let mut scenes = self.steps(&[window], cameras)?;
+        scenes.pop().context("the network gave no scene")?
+    }
+
+    /// Runs the network on several windows in one forward pass. One result per window: a window whose result is not
+    /// finite does not spoil the others.
+    ///
+    /// # Errors
+    /// Windows whose shapes differ or that the network does not take.
+    pub fn steps(&mut self, windows: &[&Window<Frame>], cameras: &[Intrinsics]) -> Result<Vec<Result<Scene>>> {
+        let clips = windows.iter().map(|w| self.clip(w, cameras)).collect::<Result<Vec<_>>>()?;
+        let output = match clips.as_slice() {
+            [] => return Ok(Vec::new()),
+            [one] => self.model.forward(one)?,
+            several => self.model.forward(&ClipBatch::stack(several)?)?,
+        };
+        Ok((0..clips.len()).map(|i| Ok(output.scene(i)?)).collect())
     }
 
     /// One window as the network takes it.
-    pub fn batch(&self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<ClipBatch> {
+    pub fn clip(&self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<ClipBatch> {
         let pictures: Vec<Vec<Vec<f32>>> = window
             .steps
             .iter()

@@ -1,11 +1,12 @@
 //! The map as plain arrays, ready to be written or drawn.
 
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Quat, Vec3};
 use rayon::prelude::*;
 
-use super::cell::Cell;
+use super::cell::{Cell, Sample, covariance};
 use super::eigen::rotation_and_scales;
-use super::voxel::level_of;
+use super::tile::TileIndex;
+use super::voxel::{key_at, level_of};
 
 /// Standard deviations below this come out as this, metres: a flat or single-point cell stays drawable.
 const MIN_SCALE_M: f64 = 1e-4;
@@ -63,6 +64,32 @@ impl MapCloud {
             self.quats.push(quat);
             self.confidences.push(c.weight);
         }
+    }
+
+    /// Gaussian `i` as a cell of the finest voxels, and the tile it belongs to; none when a number is not one that a map
+    /// holds.
+    pub(super) fn cell(&self, i: usize, tile_m: f64, voxel_m: f64) -> Option<(TileIndex, Cell)> {
+        let place = Vec3::from(*self.positions.get(i)?).as_dvec3() / tile_m;
+        let (index, [w, x, y, z]) = (place.floor(), *self.quats.get(i)?);
+        let (q, scale) = (Quat::from_xyzw(x, y, z, w), Vec3::from(*self.scales.get(i)?));
+        let (color, opacity) = (Vec3::from(*self.colors01.get(i)?), *self.opacities.get(i)?);
+        let weight = *self.confidences.get(i)?;
+        let plausible = index.abs().max_element() < f64::from(i32::MAX / 2)
+            && scale.is_finite()
+            && q.length() > 1e-6
+            && q.is_finite()
+            && color.is_finite()
+            && (0.0..=1.0).contains(&opacity)
+            && weight > 0.0;
+        if !plausible {
+            return None;
+        }
+        let position = ((place - index) * tile_m).as_vec3();
+        let (ray, gate_m, level, fresh) = (Vec3::ZERO, 0.0, 0, true);
+        let cov = covariance(q.normalize(), scale);
+        let sample = Sample { position, cov, color, opacity, weight, ray, gate_m, level, fresh };
+        let key = key_at(position, (1.0 / voxel_m) as f32, 0);
+        Some((index.to_array().map(|x| x as i32), Cell::new(key, &sample, 0)))
     }
 
     /// Number of Gaussians.

@@ -14,6 +14,54 @@ use super::place::{Eye, PlacedChunk, Placement};
 use super::tile::{Tile, TileCounts, TileIndex};
 use super::{DepthView, MapCounts, StaticMap};
 
+/// Which samples belong to which tile: all of them in one list, tile by tile, in the window's order within each.
+///
+/// A list of its own for every tile would remember the most any tile ever had at its place in memory, and tiles change
+/// places: on long drives that grew without end.
+#[derive(Debug, Default)]
+pub(super) struct Jobs {
+    /// Tile of every sample, in order.
+    tile_of: Vec<u32>,
+    /// First of every tile's in `samples`, and the end.
+    starts: Vec<u32>,
+    /// Chunk, and number in it.
+    samples: Vec<(u32, u32)>,
+}
+
+impl Jobs {
+    fn sort(&mut self, placed: &[PlacedChunk], tiles: usize) {
+        self.starts.clear();
+        self.starts.resize(tiles + 1, 0);
+        self.tile_of.iter().for_each(|&t| self.starts[t as usize + 1] += 1);
+        for t in 0..tiles {
+            self.starts[t + 1] += self.starts[t];
+        }
+        self.samples.clear();
+        self.samples.resize(self.tile_of.len(), (0, 0));
+        let chunks = placed.iter().enumerate();
+        let names = chunks.flat_map(|(c, chunk)| (0..chunk.samples.len()).map(move |s| (c as u32, s as u32)));
+        for (&t, name) in self.tile_of.iter().zip(names) {
+            let next = &mut self.starts[t as usize];
+            self.samples[*next as usize] = name;
+            *next += 1;
+        }
+        // Every start has become its tile's end: one to the right.
+        self.starts.copy_within(..tiles, 1);
+        self.starts[0] = 0;
+    }
+
+    /// A tile's samples.
+    fn of(&self, tile: usize) -> &[(u32, u32)] {
+        let at = |i: usize| self.starts.get(i).map_or(self.samples.len(), |&s| s as usize);
+        &self.samples[at(tile)..at(tile + 1)]
+    }
+
+    pub fn bytes(&self) -> usize {
+        (self.tile_of.capacity() + self.starts.capacity()) * size_of::<u32>()
+            + self.samples.capacity() * size_of::<(u32, u32)>()
+    }
+}
+
 /// One window as it is offered to the map.
 #[derive(Debug, Clone, Copy)]
 pub struct MapWindow<'a> {
@@ -82,21 +130,22 @@ impl StaticMap {
         counts
     }
 
-    /// Fills `jobs`: per tile, which samples are its own. Tiles on disk come back, new ones are made.
+    /// Fills `jobs`. Tiles on disk come back, new ones are made.
     fn hand_out(&mut self, placed: &[PlacedChunk], counts: &mut MapCounts) {
-        self.jobs.iter_mut().for_each(Vec::clear);
+        let mut tile_of = std::mem::take(&mut self.jobs.tile_of);
+        tile_of.clear();
         // Neighbouring pixels mostly share a tile.
         let mut last: Option<(TileIndex, usize)> = None;
-        for (c, chunk) in placed.iter().enumerate() {
-            for (s, (index, _)) in chunk.samples.iter().enumerate() {
-                let at = match last {
-                    Some((known, at)) if known == *index => at,
-                    _ => self.tile_at(index, counts),
-                };
-                last = Some((*index, at));
-                self.jobs[at].push((c as u32, s as u32));
-            }
+        for (index, _) in placed.iter().flat_map(|chunk| &chunk.samples) {
+            let at = match last {
+                Some((known, at)) if known == *index => at,
+                _ => self.tile_at(index, counts),
+            };
+            last = Some((*index, at));
+            tile_of.push(at as u32);
         }
+        self.jobs.tile_of = tile_of;
+        self.jobs.sort(placed, self.tiles.len());
     }
 
     /// Number of the tile in memory, made or brought back if it is not there.
@@ -127,9 +176,6 @@ impl StaticMap {
         let at = self.tiles.len();
         self.by_index.insert(tile.index, at as u32);
         self.tiles.push(tile);
-        if self.jobs.len() <= at {
-            self.jobs.push(Vec::new());
-        }
         at
     }
 
@@ -137,7 +183,7 @@ impl StaticMap {
         let now_ms = (stamp_ns.saturating_sub(self.first_stamp_ns) / 1_000_000).clamp(0, i64::from(u32::MAX)) as u32;
         let (origin, tile_m, reach_m) = (self.origin(), self.config.tile_m, self.config.max_depth_m);
         let revision = self.revision;
-        let fuse = |(tile, job): (&mut Tile, &Vec<(u32, u32)>)| {
+        let fuse = |(tile, job): (&mut Tile, &[(u32, u32)])| {
             let mut counts = TileCounts::default();
             for &(c, s) in job {
                 tile.add(&placed[c as usize].samples[s as usize].1, now_ms, &mut counts);
@@ -154,7 +200,7 @@ impl StaticMap {
         };
         let jobs = &self.jobs;
         let all: Vec<TileCounts> =
-            self.tiles.par_iter_mut().zip(&jobs[..]).with_max_len(8).map(|(tile, job)| fuse((tile, job))).collect();
+            self.tiles.par_iter_mut().enumerate().with_max_len(8).map(|(at, tile)| fuse((tile, jobs.of(at)))).collect();
         for c in all {
             counts.merged += c.merged;
             counts.created += c.created;

@@ -36,6 +36,8 @@ pub struct SceneLook<'a> {
     pub poses: &'a [Rigid],
     /// The newest timestep as the scene shows it, with flow, one per camera; empty: the Gaussians' own speed decides.
     pub rendered: &'a [RenderedView],
+    /// How far each Gaussian's place is borne out by other looks, 0 to 1, 0.5 where nothing is known; empty: all alike.
+    pub confidence: &'a [f32],
     /// First timestep that no earlier window had.
     pub first_new: usize,
 }
@@ -75,7 +77,8 @@ impl StaticMap {
         };
         let config = self.config.clone();
         let select = |i: usize| {
-            let share = if i < window.first_new { REPEAT_SHARE } else { 1.0 };
+            let borne_out = 2.0 * look.confidence.get(i).copied().unwrap_or(0.5);
+            let share = if i < window.first_new { REPEAT_SHARE * borne_out } else { borne_out };
             let weight = || static_weight(&config, scene.gaussians.opacities[i], 0.0, scene.depths[i]);
             if standing[i] { weight().map(|w| w * share) } else { None }
         };

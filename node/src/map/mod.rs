@@ -35,9 +35,10 @@ pub use correct::PoseCorrection;
 pub use error::MapError;
 use format::MapIndex;
 pub use free_space::DepthView;
+use fuse::Jobs;
 pub use fuse::MapWindow;
 pub use gather::SceneLook;
-pub(crate) use hash::VoxelHash;
+use hash::VoxelHash;
 pub use model::{ObjectModel, ObjectSample};
 pub use place::Eye;
 pub use select::{color01, confidence, static_weight};
@@ -118,8 +119,8 @@ pub struct StaticMap {
     revision: u64,
     tiles: Vec<Tile>,
     by_index: HashMap<TileIndex, u32, VoxelHash>,
-    /// Per tile, which samples of the window being fused are its own; kept for its memory.
-    jobs: Vec<Vec<(u32, u32)>>,
+    /// Which samples of the window being fused belong to which tile; kept for its memory.
+    jobs: Jobs,
     store: Option<Store>,
     /// Putting tiles to disk is not tried again before this revision.
     retry_spill_at: u64,
@@ -137,7 +138,7 @@ impl StaticMap {
             revision: 0,
             tiles: Vec::new(),
             by_index: HashMap::default(),
-            jobs: Vec::new(),
+            jobs: Jobs::default(),
             store: None,
             retry_spill_at: 0,
             counts: MapCounts::default(),
@@ -149,7 +150,9 @@ impl StaticMap {
     /// # Errors
     /// A folder that cannot be made or emptied.
     pub fn in_folder(config: &MapConfig, dir: &Path) -> Result<Self, MapError> {
-        Ok(Self { store: Some(Store::create(dir)?), ..Self::new(config) })
+        let mut store = Store::create(dir)?;
+        store.set_sync(config.sync);
+        Ok(Self { store: Some(store), ..Self::new(config) })
     }
 
     /// A map saved in `dir`, ready to grow. Its tiles stay on disk until they are needed.
@@ -160,7 +163,8 @@ impl StaticMap {
     /// No index, a damaged index, other tile or voxel sizes than `config` asks for, and without `salvage` any damaged
     /// tile.
     pub fn load(config: &MapConfig, dir: &Path, salvage: bool) -> Result<(Self, Vec<MapError>), MapError> {
-        let (store, index, problems) = Store::open(dir, salvage)?;
+        let (mut store, index, problems) = Store::open(dir, salvage)?;
+        store.set_sync(config.sync);
         for (name, saved, wanted) in
             [("map.tile_m", index.tile_m, config.tile_m), ("map.voxel_m", index.voxel_m, config.voxel_m)]
         {
@@ -194,6 +198,32 @@ impl StaticMap {
         drop(Store::create(dir)?);
         store::copy(from, dir)?;
         Ok(Self::load(config, dir, false)?.0)
+    }
+
+    /// A map of finished Gaussians in the folder `dir`, each in the finest voxel around its centre: what a later drive sees
+    /// of the place refines nothing finer. Gaussians that share a voxel are merged; what is not finite is left out and
+    /// counted (`rejected`). A map that was saved there goes.
+    ///
+    /// # Errors
+    /// As [`StaticMap::in_folder`].
+    pub fn of_cloud(config: &MapConfig, dir: &Path, cloud: &MapCloud) -> Result<Self, MapError> {
+        let mut map = Self::in_folder(config, dir)?;
+        map.set_origin(cloud.origin);
+        map.revision = 1;
+        let mut counts = MapCounts::default();
+        for i in 0..cloud.len() {
+            let Some((index, cell)) = cloud.cell(i, config.tile_m, config.voxel_m) else {
+                counts.rejected += 1;
+                continue;
+            };
+            let at = map.tile_at(&index, &mut counts);
+            let tile = &mut map.tiles[at];
+            tile.adopt(cell);
+            tile.revision = map.revision;
+        }
+        counts.created = map.loaded() as u64;
+        map.counts.add(&counts);
+        Ok(map)
     }
 
     /// Writes what has changed since the last save, then an index of everything: a process that dies at any moment
@@ -271,6 +301,12 @@ impl StaticMap {
     /// Memory held, bytes.
     pub fn bytes(&self) -> usize {
         self.tiles.iter().map(Tile::bytes).sum()
+    }
+
+    /// Memory held beside the tiles: their index, and what fusing a window needs, bytes.
+    pub fn side_bytes(&self) -> usize {
+        let index = self.by_index.capacity() * (size_of::<(TileIndex, u32)>() + 1);
+        index + self.jobs.bytes() + self.store.as_ref().map_or(0, Store::memory_bytes)
     }
 
     /// Space taken on disk by the newest version of every saved tile, bytes.

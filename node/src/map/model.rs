@@ -94,6 +94,11 @@ impl ObjectModel {
         cloud
     }
 
+    /// Memory held, bytes.
+    pub fn bytes(&self) -> usize {
+        self.tile.as_ref().map_or(0, Tile::bytes)
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.tile.as_ref().map_or(0, Tile::len)

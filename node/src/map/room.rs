@@ -79,8 +79,6 @@ impl StaticMap {
         if let Some(moved) = self.tiles.get(at) {
             self.by_index.insert(moved.index, at as u32);
         }
-        // `jobs` belongs to places, not to tiles: it is filled anew for every window.
-        self.jobs.truncate(self.tiles.len());
         tile
     }
 

@@ -7,7 +7,7 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use crate::output::atomic::write_bytes;
+use crate::output::atomic::{sync_files, write_bytes, write_bytes_synced};
 
 use super::error::MapError;
 use super::format::{IndexEntry, MapIndex, decode_index, decode_tile, encode_index, encode_tile};
@@ -20,10 +20,23 @@ const INDEX_FILE: &str = "map.index";
 const TILE_ENDING: &str = "tile";
 
 /// The newest saved version of a tile.
+///
+/// There is one of them for every tile ever seen, so they are small.
 #[derive(Debug, Clone, Copy)]
 struct Saved {
-    entry: IndexEntry,
-    bytes: u64,
+    revision: u64,
+    cells: u32,
+    crc: u32,
+    /// Of its file.
+    bytes: u32,
+    /// The index file on disk names this version.
+    listed: bool,
+}
+
+impl Saved {
+    fn entry(&self, index: TileIndex) -> IndexEntry {
+        IndexEntry { index, revision: self.revision, cells: self.cells, crc: self.crc }
+    }
 }
 
 /// A folder of tiles.
@@ -31,10 +44,12 @@ struct Saved {
 pub(super) struct Store {
     dir: PathBuf,
     saved: HashMap<TileIndex, Saved, VoxelHash>,
-    /// Versions the index file on disk names.
-    listed: HashMap<TileIndex, u64, VoxelHash>,
     /// Files that go once a newer index is in place.
     stale: Vec<PathBuf>,
+    /// Files that the next index will name and that may not be on the disk itself yet.
+    unsynced: Vec<PathBuf>,
+    /// Whether to wait for the disk before an index names them.
+    sync: bool,
     bytes: u64,
 }
 
@@ -56,8 +71,8 @@ impl Store {
     }
 
     fn empty(dir: &Path) -> Self {
-        let (saved, listed) = (HashMap::default(), HashMap::default());
-        Self { dir: dir.to_owned(), saved, listed, stale: Vec::new(), bytes: 0 }
+        let (stale, unsynced) = (Vec::new(), Vec::new());
+        Self { dir: dir.to_owned(), saved: HashMap::default(), stale, unsynced, sync: false, bytes: 0 }
     }
 
     /// A saved map. Every tile is read once; damaged ones are an error, or left out and named when `salvage` is set.
@@ -68,16 +83,27 @@ impl Store {
             let path = store.path(entry);
             match decode_tile(&path, entry, index.voxel_m) {
                 Ok(_) => {
-                    let bytes = std::fs::metadata(&path).map_or(0, |m| m.len());
-                    store.bytes += bytes;
-                    store.saved.insert(entry.index, Saved { entry: *entry, bytes });
-                    store.listed.insert(entry.index, entry.revision);
+                    let size = std::fs::metadata(&path).map_or(0, |m| m.len());
+                    store.insert(entry, size, true);
                 }
                 Err(e) if salvage => problems.push(e),
                 Err(e) => return Err(e),
             }
         }
         Ok((store, index, problems))
+    }
+
+    fn insert(&mut self, entry: &IndexEntry, size: u64, listed: bool) {
+        // No tile's file is that large (`MAX_CELLS`).
+        let bytes = u32::try_from(size).unwrap_or(u32::MAX);
+        self.bytes += u64::from(bytes);
+        let saved = Saved { revision: entry.revision, cells: entry.cells, crc: entry.crc, bytes, listed };
+        self.saved.insert(entry.index, saved);
+    }
+
+    /// Whether every index waits until its tiles and itself are on the disk.
+    pub fn set_sync(&mut self, sync: bool) {
+        self.sync = sync;
     }
 
     pub fn dir(&self) -> &Path {
@@ -94,36 +120,44 @@ impl Store {
         self.bytes
     }
 
+    /// Memory held, bytes.
+    pub fn memory_bytes(&self) -> usize {
+        self.saved.capacity() * (size_of::<(TileIndex, Saved)>() + 1) + self.stale.capacity() * size_of::<PathBuf>()
+    }
+
     pub fn has(&self, index: &TileIndex) -> bool {
         self.saved.contains_key(index)
     }
 
     /// Tiles saved, with their cells, in no order.
     pub fn tiles(&self) -> impl Iterator<Item = (TileIndex, u64, u32)> + '_ {
-        self.saved.values().map(|s| (s.entry.index, s.entry.revision, s.entry.cells))
+        self.saved.iter().map(|(index, s)| (*index, s.revision, s.cells))
     }
 
     /// Writes a tile unless this version is there already. On error nothing has changed.
     pub fn put(&mut self, tile: &Tile) -> Result<(), MapError> {
-        if self.saved.get(&tile.index).is_some_and(|s| s.entry.revision == tile.revision) {
+        if self.saved.get(&tile.index).is_some_and(|s| s.revision == tile.revision) {
             return Ok(());
         }
         let (bytes, crc) = encode_tile(tile).map_err(MapError::io(&self.dir))?;
         let cells = tile.cells.len() as u32;
         let entry = IndexEntry { index: tile.index, revision: tile.revision, cells, crc };
-        write_bytes(&self.path(&entry), &bytes)?;
+        let path = self.path(&entry);
+        write_bytes(&path, &bytes)?;
+        if self.sync {
+            self.unsynced.push(path);
+        }
         self.discard(&tile.index);
-        self.bytes += bytes.len() as u64;
-        self.saved.insert(tile.index, Saved { entry, bytes: bytes.len() as u64 });
+        self.insert(&entry, bytes.len() as u64, false);
         Ok(())
     }
 
     /// Forgets a tile; its file goes now, or with the next index if the present one names it.
     pub fn discard(&mut self, index: &TileIndex) {
         let Some(old) = self.saved.remove(index) else { return };
-        self.bytes -= old.bytes;
-        let path = self.path(&old.entry);
-        if self.listed.get(index) == Some(&old.entry.revision) {
+        self.bytes -= u64::from(old.bytes);
+        let path = self.path(&old.entry(*index));
+        if old.listed {
             self.stale.push(path);
         } else {
             // A file that stays behind is only a little space.
@@ -134,15 +168,24 @@ impl Store {
     /// Reads a tile back; none when there is none.
     pub fn get(&self, index: &TileIndex, voxel_m: f64) -> Option<Result<Tile, MapError>> {
         let saved = self.saved.get(index)?;
-        Some(decode_tile(&self.path(&saved.entry), &saved.entry, voxel_m))
+        let entry = saved.entry(*index);
+        Some(decode_tile(&self.path(&entry), &entry, voxel_m))
     }
 
     /// Puts an index of all saved tiles in place of the last one, then removes what nobody names any more.
     pub fn commit(&mut self, mut index: MapIndex) -> Result<(), MapError> {
-        index.entries = self.saved.values().map(|s| s.entry).collect();
+        index.entries = self.saved.iter().map(|(at, s)| s.entry(*at)).collect();
         index.entries.sort_unstable_by_key(|e| e.index);
-        write_bytes(&self.dir.join(INDEX_FILE), &encode_index(&index))?;
-        self.listed = index.entries.iter().map(|e| (e.index, e.revision)).collect();
+        let (path, bytes) = (self.dir.join(INDEX_FILE), encode_index(&index));
+        if self.sync {
+            // First the tiles, then the index that names them.
+            sync_files(&self.dir, self.unsynced.iter().map(PathBuf::as_path))?;
+            write_bytes_synced(&path, &bytes)?;
+            self.unsynced.clear();
+        } else {
+            write_bytes(&path, &bytes)?;
+        }
+        self.saved.values_mut().for_each(|s| s.listed = true);
         for path in self.stale.drain(..) {
             let _ = std::fs::remove_file(path);
         }

@@ -1,5 +1,7 @@
 use glam::{DMat3, DQuat, EulerRot, Vec3};
 use proptest::prelude::*;
+use storm_model::config::ModelConfig;
+use storm_model::scene::{Affine, Scene, SceneShape};
 use storm_render::{Gaussians, Intrinsics};
 
 use super::*;
@@ -234,6 +236,60 @@ fn look(map: &mut StaticMap, stamp_ms: i64, at: DVec3, g: &Gaussians, k: &Intrin
     let views = [DepthView { map_from_camera: camera, intrinsics: *k, depth }];
     let window = MapWindow { eyes: &eyes, pixels: g.len(), views: &views, ..window(stamp_ms * 1_000_000, &pose, g) };
     map.fuse(&window, |i| Some(confidence(1.0, Vec3::from(g.means[i]).length())), |_| [0.5; 3])
+}
+
+/// Two cameras see one wall, each with its own exposure; the network's colours are before exposure, and how bright those are
+/// is its own choice in every window. Merged, the wall has the colour that the cameras show on average.
+#[test]
+fn exposure_is_undone_before_colours_merge() {
+    let gain = |x: f32| Affine { matrix: [[x, 0.0, 0.0], [0.0, x, 0.0], [0.0, 0.0, x]], bias: [0.0; 3] };
+    let (one, k) = wall(24, 8.0, |_| 0.0);
+    // As the pictures have it, the mean of both cameras: -1 to 1.
+    let shown = [0.5f32, -0.2, 0.1];
+    let pose = Rigid::IDENTITY;
+    let camera = pose * crate::window::camera_from_flu().inverse();
+    let fuse = |map: &mut StaticMap, step: i64, gains: [f32; 2]| {
+        let mean = 0.5 * (gains[0] + gains[1]);
+        let mut g = Gaussians::default();
+        for _ in gains {
+            g.means.extend(&one.means);
+            g.quats.extend(&one.quats);
+            g.scales.extend(&one.scales);
+            g.opacities.extend(&one.opacities);
+            g.colors.extend(one.colors.iter().map(|_| shown.map(|c| c / mean)));
+        }
+        let still = vec![[0.0; 3]; g.len()];
+        (g.velocity_backward, g.velocity_forward, g.time_sec) = (still.clone(), still, vec![0.0; g.len()]);
+        let scene = Scene {
+            depths: vec![8.0; g.len()],
+            gaussians: g,
+            shape: SceneShape { timesteps: 1, cameras: 2, height: 24, width: 24 },
+            sky: None,
+            affine: gains.map(gain).to_vec(),
+            motion_bases: Vec::new(),
+            config: ModelConfig::preset("tiny").unwrap().into(),
+        };
+        let counts = map.fuse_scene(&SceneLook {
+            stamp_ns: step * 100_000_000,
+            map_from_anchor: &pose,
+            scene: &scene,
+            cameras: &[k, k],
+            poses: &[camera, camera],
+            rendered: &[],
+            confidence: &[],
+            first_new: 0,
+        });
+        assert!(counts.created + counts.merged > 500, "{counts:?}");
+    };
+    let mut map = StaticMap::new(&MapConfig::default());
+    // The second camera much brighter; then the network takes everything for darker, then for brighter.
+    for (step, gains) in [[0.6, 1.4], [0.9, 2.1], [0.5, 0.7]].into_iter().enumerate() {
+        fuse(&mut map, step as i64, gains);
+    }
+    let wanted = color01(&shown);
+    let cloud = map.cloud().unwrap();
+    let worst = cloud.colors01.iter().flat_map(|c| (0..3).map(|k| (c[k] - wanted[k]).abs())).fold(0.0, f32::max);
+    assert!(cloud.len() > 100 && worst < 1e-4, "{worst}");
 }
 
 #[test]

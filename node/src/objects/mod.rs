@@ -120,6 +120,12 @@ impl ObjectTracker {
         self.drain()
     }
 
+    /// Memory held, bytes.
+    pub fn bytes(&self) -> usize {
+        let parts: usize = self.live.iter().chain(&self.ended).map(MovingObject::bytes).sum();
+        parts + (self.live.capacity() + self.ended.capacity()) * size_of::<MovingObject>()
+    }
+
     /// What became of groups and objects so far.
     pub fn counts(&self) -> ObjectCounts {
         self.counts

@@ -21,6 +21,9 @@ const HEADING_MPS: f64 = 1.0;
 const CENTER_SHARE: f64 = 0.2;
 /// Share of a new view in the remembered offset of the seen part's centre.
 const OFFSET_SHARE: f64 = 0.1;
+/// An acceleration is the slope of the velocities over this long, and is not given before there are this many seconds.
+const SLOPE_SEC: f64 = 1.0;
+const SLOPE_LEAST_SEC: f64 = 0.45;
 /// Poses kept: a minute at 10 Hz.
 const HISTORY: usize = 600;
 
@@ -128,6 +131,11 @@ impl MovingObject {
         }
     }
 
+    /// Memory of its poses and Gaussians, bytes.
+    pub(super) fn bytes(&self) -> usize {
+        self.states.capacity() * size_of::<ObjectState>() + self.model.bytes()
+    }
+
     /// Whether it was seen often enough to be believed.
     pub fn confirmed(&self, config: &ObjectsConfig) -> bool {
         self.steps >= config.confirm_steps
@@ -146,6 +154,28 @@ impl MovingObject {
     /// Velocity, map axes, m/s.
     pub fn velocity_mps(&self) -> DVec3 {
         self.last().velocity_mps
+    }
+
+    /// Change of velocity, map axes, m/s^2; see [`MovingObject::acceleration_at`].
+    pub fn acceleration_mps2(&self) -> Option<DVec3> {
+        self.acceleration_at(self.states.len().checked_sub(1)?)
+    }
+
+    /// Change of velocity up to a state over the second before it, map axes, m/s^2, by least squares: consecutive windows
+    /// see the same object, so this is how their velocities differ. None before half a second of it was seen.
+    pub fn acceleration_at(&self, state: usize) -> Option<DVec3> {
+        let last = self.states.get(state)?;
+        let recent = || {
+            let before = (0..=state).rev().filter_map(|i| self.states.get(i));
+            let timed = before.map(|s| (-seconds_between(s.stamp_ns, last.stamp_ns), s.velocity_mps));
+            timed.take_while(|(t, _)| *t >= -SLOPE_SEC)
+        };
+        let n = recent().count() as f64;
+        let (mean_t, mean_v) = (recent().map(|r| r.0).sum::<f64>() / n, recent().map(|r| r.1).sum::<DVec3>() / n);
+        let spread: f64 = recent().map(|(t, _)| (t - mean_t).powi(2)).sum();
+        let long = recent().last().is_some_and(|(t, _)| t <= -SLOPE_LEAST_SEC);
+        let slope = recent().map(|(t, v)| (v - mean_v) * (t - mean_t)).sum::<DVec3>() / spread;
+        (long && spread > 0.0 && slope.is_finite()).then_some(slope)
     }
 
     /// Covariance of the velocity, map axes, (m/s)^2.

@@ -119,3 +119,17 @@ fn nonsense_is_refused_and_counted() {
     let few = ObjectTracker::new(&ObjectsConfig::default()).step(0, 0, &good[..4]);
     assert!(few.iter().all(Option::is_none));
 }
+
+#[test]
+fn braking_shows_as_change_between_windows() {
+    // 15 m/s, and from a second on brakes by 4 m/s^2.
+    let speed = |t: f64| 15.0 - 4.0 * (t - 1.0).max(0.0);
+    let way = |t: f64| 15.0 * t - 2.0 * (t - 1.0).max(0.0).powi(2);
+    let (t, _) = run(31, |time, i| car(DVec3::X * way(time), 0.0, speed(time), true, i));
+    let object = &t.live()[0];
+    let braking = object.acceleration_mps2().unwrap();
+    assert!((braking - DVec3::new(-4.0, 0.0, 0.0)).length() < 0.5, "{braking}");
+    // The tenth of its states is before braking, the second too early to say.
+    assert!(object.acceleration_at(9).unwrap().length() < 0.5);
+    assert!(object.acceleration_at(1).is_none());
+}

@@ -19,11 +19,23 @@ pub fn write_atomic(
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<File>) -> Result<(), OutputError>,
 ) -> Result<(), OutputError> {
+    write(path, false, fill)
+}
+
+/// `sync`: the file is on the disk itself before it gets its name.
+fn write(
+    path: &Path,
+    sync: bool,
+    fill: impl FnOnce(&mut BufWriter<File>) -> Result<(), OutputError>,
+) -> Result<(), OutputError> {
     let part = part_path(path);
     let result = (|| {
         let mut out = BufWriter::new(File::create(&part).map_err(OutputError::io(&part))?);
         fill(&mut out)?;
         out.flush().map_err(OutputError::io(&part))?;
+        if sync {
+            out.get_ref().sync_data().map_err(OutputError::io(&part))?;
+        }
         drop(out);
         std::fs::rename(&part, path).map_err(OutputError::io(path))
     })();
@@ -34,9 +46,39 @@ pub fn write_atomic(
     result
 }
 
+/// Waits until files and their names are on the disk itself, so that a machine that loses its power keeps them. `paths` are
+/// of one folder, `dir`.
+///
+/// # Errors
+/// A file that cannot be opened or that the disk does not take.
+pub fn sync_files<'a>(dir: &Path, paths: impl IntoIterator<Item = &'a Path>) -> Result<(), OutputError> {
+    for path in paths {
+        match File::open(path) {
+            Ok(file) => file.sync_data().map_err(OutputError::io(path))?,
+            // Replaced or given up meanwhile: nobody will miss it.
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
+            Err(e) => return Err(OutputError::io(path)(e)),
+        }
+    }
+    // Names live in the folder. Windows has no such call and keeps names by itself.
+    if cfg!(unix) {
+        File::open(dir).and_then(|d| d.sync_all()).map_err(OutputError::io(dir))?;
+    }
+    Ok(())
+}
+
 /// Writes `bytes` to `path`, whole or not at all.
 pub fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), OutputError> {
     write_atomic(path, |out| out.write_all(bytes).map_err(OutputError::io(path)))
+}
+
+/// The same, and on the disk itself when it returns: the old file or the new one outlives a loss of power.
+pub fn write_bytes_synced(path: &Path, bytes: &[u8]) -> Result<(), OutputError> {
+    write(path, true, |out| out.write_all(bytes).map_err(OutputError::io(path)))?;
+    match path.parent() {
+        Some(dir) => sync_files(dir, []),
+        None => Ok(()),
+    }
 }
 
 #[cfg(test)]
@@ -57,6 +99,17 @@ mod tests {
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
         write_bytes(&path, b"new").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
+    }
+
+    #[test]
+    fn syncing_passes_over_what_is_gone() {
+        let dir = tempfile::tempdir().unwrap();
+        let (here, gone) = (dir.path().join("a"), dir.path().join("b"));
+        write_bytes(&here, b"x").unwrap();
+        sync_files(dir.path(), [here.as_path(), gone.as_path()]).unwrap();
+        write_bytes_synced(&here, b"y").unwrap();
+        assert_eq!(std::fs::read(&here).unwrap(), b"y");
+        assert!(sync_files(&gone, []).is_err() || !cfg!(unix));
     }
 
     #[test]

@@ -7,6 +7,7 @@ use serde::Serialize;
 use crate::engine::score::Scores;
 use crate::map::MapCounts;
 use crate::objects::ObjectCounts;
+use crate::overlap::OverlapCounts;
 use crate::sync::DropReason;
 use crate::tracks::TrackCounts;
 
@@ -105,6 +106,10 @@ pub struct Metrics {
     pub track_counts: TrackCounts,
     /// What became of moving objects.
     pub objects: ObjectCounts,
+    /// What overlapping windows said of each other.
+    pub overlap: OverlapCounts,
+    /// Windows per forward pass of the network.
+    pub batch: usize,
     /// What `map.ply` is relative to, map frame, metres.
     pub origin_m: [f64; 3],
     /// Times the clock jumped or the recording looped.

@@ -40,6 +40,8 @@ pub struct ReplayOptions {
     pub out: PathBuf,
     /// The configuration.
     pub config: Config,
+    /// Windows that go through the network in one forward pass; at least 1. The results are those of one by one.
+    pub batch: usize,
     /// Raised by whoever wants the run to end early; what was read until then is finished and written.
     pub stop: Arc<AtomicBool>,
 }
@@ -155,10 +157,13 @@ fn step_all(
     let mut front = Front::new(config, rig, store);
     let mut maker = StepMaker::new(engine, rig.intrinsics(), config, Some(&options.out.join(MAP_FOLDER)))?;
     let mut saver = Saver { every_sec: config.map.save_every_sec, last: Instant::now(), failed: 0 };
+    let batch = options.batch.max(1);
     let mut ready = VecDeque::new();
     for event in events {
         front.take(event, &mut ready);
-        if !hand_on(&mut ready, &front, &mut maker, to_sink)? {
+        let windows = ready.iter().filter(|o| matches!(o, FrontOutput::Window(_))).count();
+        // What came after a window that waits for others waits with it, so that the order of results stays the same.
+        if (windows == 0 || windows >= batch) && !hand_on(&mut ready, &front, &mut maker, to_sink)? {
             break;
         }
         saver.offer(&mut maker);
@@ -166,7 +171,7 @@ fn step_all(
     front.finish(&mut ready);
     hand_on(&mut ready, &front, &mut maker, to_sink)?;
     saver.save(&mut maker);
-    Ok((front, Finished { map_saves_failed: saver.failed, ..maker.finish() }))
+    Ok((front, Finished { map_saves_failed: saver.failed, batch, ..maker.finish() }))
 }
 
 /// Saves the map every so often of wall time: what a killed run loses is time somebody waited. When it happens changes
@@ -194,37 +199,41 @@ impl Saver {
     }
 }
 
-/// Runs windows, passes the rest through; false when the writer has gone.
+/// Runs windows (all of them in one forward pass), passes the rest through; false when the writer has gone.
 fn hand_on(
     ready: &mut VecDeque<FrontOutput>,
     front: &Front,
     maker: &mut StepMaker,
     to_sink: &Sender<SinkInput>,
 ) -> Result<bool> {
-    while let Some(output) = ready.pop_front() {
-        let input = match output {
-            FrontOutput::Set(set) => {
-                let vehicle = set.frames.first().map(|f| (f.stamp_ns, front.base_pose(0, &f.map_from_camera)));
-                SinkInput::Set { set, vehicle }
-            }
-            FrontOutput::Truth { camera, stamp_ns, kind, image } => SinkInput::Truth { camera, stamp_ns, kind, image },
+    let (mut windows, mut rest) = (Vec::new(), Vec::with_capacity(ready.len()));
+    for output in ready.drain(..) {
+        match output {
             FrontOutput::Window(window) => {
-                let step = maker.run(window)?;
-                let ended = maker.ended_tracks();
-                if !ended.is_empty() && to_sink.send(SinkInput::Tracks(ended)).is_err() {
-                    return Ok(false);
-                }
-                let ended = maker.ended_objects();
-                if !ended.is_empty() && to_sink.send(SinkInput::Objects(ended)).is_err() {
-                    return Ok(false);
-                }
-                match step {
-                    Some(step) => SinkInput::Step(Arc::new(step)),
-                    None => continue,
-                }
+                windows.push(window);
+                rest.push(None);
             }
+            other => rest.push(Some(other)),
+        }
+    }
+    let mut results = maker.run_all(windows)?.into_iter();
+    let send = |input: SinkInput| to_sink.send(input).is_ok();
+    for output in rest {
+        let sent = match output {
+            Some(FrontOutput::Set(set)) => {
+                let vehicle = set.frames.first().map(|f| (f.stamp_ns, front.base_pose(0, &f.map_from_camera)));
+                send(SinkInput::Set { set, vehicle })
+            }
+            Some(FrontOutput::Truth { camera, stamp_ns, kind, image }) => {
+                send(SinkInput::Truth { camera, stamp_ns, kind, image })
+            }
+            Some(FrontOutput::Window(_)) | None => results.next().is_none_or(|r| {
+                (r.tracks.is_empty() || send(SinkInput::Tracks(r.tracks)))
+                    && (r.objects.is_empty() || send(SinkInput::Objects(r.objects)))
+                    && r.step.is_none_or(|step| send(SinkInput::Step(Arc::new(step))))
+            }),
         };
-        if to_sink.send(input).is_err() {
+        if !sent {
             return Ok(false);
         }
     }

@@ -14,6 +14,7 @@ use crate::config::Config;
 use crate::engine::{Engine, select, views_of};
 use crate::map::{MapError, SceneLook, StaticMap};
 use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
+use crate::overlap::{Agreement, Overlap, OverlapCounts, OverlapLook};
 use crate::rigid::Rigid;
 use crate::source::Frame;
 use crate::tracks::{Track, TrackCounts, Tracker};
@@ -35,8 +36,20 @@ pub struct Step {
     pub scene: Arc<Scene>,
     /// The newest timestep's cameras as the scene shows them.
     pub views: Vec<RenderedView>,
+    /// How far this window and earlier ones agree about its Gaussians.
+    pub agreement: Agreement,
     /// Milliseconds from window to here.
     pub total_ms: f64,
+}
+
+/// What became of one window.
+pub struct StepResult {
+    /// The step; none when the network's result was not finite: the window is dropped, counted and said.
+    pub step: Option<Step>,
+    /// Trajectories that ended with it.
+    pub tracks: Vec<Track>,
+    /// Moving objects that ended with it.
+    pub objects: Vec<MovingObject>,
 }
 
 /// Runs steps; owns the network, the map and the trackers.
@@ -47,6 +60,7 @@ pub struct StepMaker {
     map: StaticMap,
     tracker: Tracker,
     objects: ObjectTracker,
+    overlap: Overlap,
     timings: Timings,
     steps: u64,
     non_finite: u64,
@@ -76,6 +90,7 @@ impl StepMaker {
             map,
             tracker: Tracker::new(&config.tracks),
             objects: ObjectTracker::new(&config.objects),
+            overlap: Overlap::new(&config.overlap),
             config: config.clone(),
             timings: Timings::default(),
             steps: 0,
@@ -86,7 +101,39 @@ impl StepMaker {
     /// Runs one window. `None` when the network's result was not finite: the window is dropped, counted and said.
     pub fn run(&mut self, window: Window<Frame>) -> Result<Option<Step>> {
         let start = Instant::now();
-        let scene = match self.timings.time("network", || self.engine.step(&window, &self.cameras)) {
+        let scene = self.engine.step(&window, &self.cameras);
+        self.take_in(window, scene, start.elapsed().as_secs_f64() * 1e3)
+    }
+
+    /// Runs windows that follow each other, the network on all of them in one forward pass, the rest one by one. In
+    /// order, one result each.
+    pub fn run_all(&mut self, windows: Vec<Window<Frame>>) -> Result<Vec<StepResult>> {
+        let start = Instant::now();
+        let scenes = self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras)?;
+        let network_ms = start.elapsed().as_secs_f64() * 1e3 / windows.len().max(1) as f64;
+        let all = windows.into_iter().zip(scenes);
+        all.map(|(window, scene)| {
+            let step = self.take_in(window, scene, network_ms)?;
+            Ok(StepResult { step, tracks: self.ended_tracks(), objects: self.ended_objects() })
+        })
+        .collect()
+    }
+
+    /// Moving objects that have ended since the last call.
+    pub fn ended_objects(&mut self) -> Vec<MovingObject> {
+        self.objects.drain()
+    }
+
+    /// Trajectories that have ended since the last call.
+    pub fn ended_tracks(&mut self) -> Vec<Track> {
+        self.tracker.drain()
+    }
+
+    /// What follows the network. `network_ms` is this window's share of its time.
+    fn take_in(&mut self, window: Window<Frame>, scene: Result<Scene>, network_ms: f64) -> Result<Option<Step>> {
+        let start = Instant::now();
+        self.timings.add("network", network_ms);
+        let mut scene = match scene {
             Ok(scene) => scene,
             Err(e) => match e.downcast_ref::<ModelError>() {
                 Some(ModelError::NonFinite { .. }) => {
@@ -97,6 +144,16 @@ impl StepMaker {
                 _ => return Err(e),
             },
         };
+        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
+        let stamps_ns: Vec<i64> = window.steps.iter().map(|s| s.stamp_ns).collect();
+        let look = OverlapLook {
+            stamps_ns: &stamps_ns,
+            epoch: window.epoch,
+            map_from_anchor: &window.map_from_anchor,
+            cameras: &self.cameras,
+            poses: &poses,
+        };
+        let agreement = self.timings.time("overlap", || self.overlap.step(&mut scene, &look));
         let newest = window.steps.len() - 1;
         let views = {
             let targets = views_of(&window.steps[newest], &window.map_from_anchor, &self.cameras);
@@ -104,7 +161,6 @@ impl StepMaker {
             let want = Want { flow: true, motion: true };
             self.timings.time("render", || self.engine.render(&scene, &targets, time_sec, want))?
         };
-        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
         let look = SceneLook {
             stamp_ns: window.stamp_ns,
             map_from_anchor: &window.map_from_anchor,
@@ -112,6 +168,7 @@ impl StepMaker {
             cameras: &self.cameras,
             poses: &poses,
             rendered: &views,
+            confidence: &agreement.geometry,
             first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
         };
         self.timings.time("map", || self.map.fuse_scene(&look));
@@ -123,21 +180,11 @@ impl StepMaker {
         self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
         let (_, parts) = select::object_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
         self.timings.time("objects", || self.objects.step(window.stamp_ns, window.epoch, &parts));
-        let total_ms = start.elapsed().as_secs_f64() * 1e3;
+        let total_ms = network_ms + start.elapsed().as_secs_f64() * 1e3;
         self.timings.add("step", total_ms);
         let index = self.steps;
         self.steps += 1;
-        Ok(Some(Step { index, window, scene: Arc::new(scene), views, total_ms }))
-    }
-
-    /// Moving objects that have ended since the last call.
-    pub fn ended_objects(&mut self) -> Vec<MovingObject> {
-        self.objects.drain()
-    }
-
-    /// Trajectories that have ended since the last call.
-    pub fn ended_tracks(&mut self) -> Vec<Track> {
-        self.tracker.drain()
+        Ok(Some(Step { index, window, scene: Arc::new(scene), views, agreement, total_ms }))
     }
 
     /// Saves the map where its folder is; nothing to do for a map in memory.
@@ -161,10 +208,12 @@ impl StepMaker {
             track_counts: self.tracker.counts(),
             objects,
             object_counts: self.objects.counts(),
+            overlap: self.overlap.counts(),
             timings: self.timings,
             steps: self.steps,
             non_finite_windows: self.non_finite,
             map_saves_failed: 0,
+            batch: 1,
         }
     }
 }
@@ -181,6 +230,8 @@ pub struct Finished {
     pub objects: Vec<MovingObject>,
     /// What became of groups and objects.
     pub object_counts: ObjectCounts,
+    /// What overlapping windows said of each other.
+    pub overlap: OverlapCounts,
     /// Stage times.
     pub timings: Timings,
     /// Steps run.
@@ -189,6 +240,8 @@ pub struct Finished {
     pub non_finite_windows: u64,
     /// Times the map could not be saved.
     pub map_saves_failed: u64,
+    /// Most windows that went through the network in one forward pass.
+    pub batch: usize,
 }
 
 /// Time of the newest timestep's reference camera in the window's clock.

@@ -2,13 +2,17 @@
 //! against it. What falls short here is the map's or the trackers' fault alone.
 
 mod map_quality;
+mod memory;
+mod motion_quality;
 mod object_quality;
 mod oracle;
 mod run;
 mod track_quality;
 
 pub use map_quality::MapFigures;
+pub use memory::Memory;
+pub use motion_quality::{MotionFigures, MotionShare};
 pub use object_quality::ObjectFigures;
 pub use oracle::{OracleErrors, OracleSet, OracleStep, OracleWindow};
-pub use run::{Quarter, SoakOptions, SoakReport, Spread, run};
+pub use run::{Growth, Quarter, SoakOptions, SoakReport, Spread, run};
 pub use track_quality::TrackFigures;

@@ -13,6 +13,9 @@ use crate::objects::ObjectTracker;
 
 use super::oracle::OracleSet;
 
+/// The second an object's acceleration is measured over.
+const SLOPE_SEC: f64 = 1.0;
+
 /// How good the objects are.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct ObjectFigures {
@@ -22,6 +25,10 @@ pub struct ObjectFigures {
     pub covered: Option<f64>,
     /// Mean error of velocity of confirmed objects against their road user's, m/s.
     pub velocity_error_mps: Option<f64>,
+    /// Mean error of acceleration over the last second against their road user's, m/s^2.
+    pub acceleration_error_mps2: Option<f64>,
+    /// The same of saying that nobody ever changes speed.
+    pub no_acceleration_error_mps2: Option<f64>,
     /// Road users that were followed.
     pub road_users: usize,
     /// Times a road user's object became another one, per road user.
@@ -36,6 +43,8 @@ pub struct ObjectJudge {
     ari: Mean,
     covered: Mean,
     velocity: Mean,
+    acceleration: Mean,
+    no_acceleration: Mean,
     /// Per road user: its object of the last step, all its objects, switches.
     followed: BTreeMap<u16, (u32, Vec<u32>, usize)>,
 }
@@ -76,12 +85,18 @@ impl ObjectJudge {
                 *votes.entry(*t as u16).or_default().entry(f - 1).or_default() += 1;
             }
         }
-        let movers = drive.movers(set.time_sec);
+        let (movers, earlier) = (drive.movers(set.time_sec), drive.movers(set.time_sec - SLOPE_SEC));
         for (instance, votes) in votes {
             let Some((&object, _)) = votes.iter().max_by_key(|(o, n)| (**n, u32::MAX - **o)) else { continue };
             let Some(o) = tracker.live().iter().find(|o| o.id == object && o.confirmed(config)) else { continue };
             if let Some(m) = movers.iter().find(|m| m.instance == instance) {
                 self.velocity.add(Some((o.velocity_mps() - m.velocity_mps).length()));
+                let before = earlier.iter().find(|e| e.id == m.id);
+                if let Some((own, before)) = o.acceleration_mps2().zip(before).filter(|_| o.age_sec() >= SLOPE_SEC) {
+                    let truth = (m.velocity_mps - before.velocity_mps) / SLOPE_SEC;
+                    self.acceleration.add(Some((own - truth).length()));
+                    self.no_acceleration.add(Some(truth.length()));
+                }
             }
             let entry = self.followed.entry(instance).or_insert_with(|| (object, Vec::new(), 0));
             entry.2 += usize::from(entry.0 != object);
@@ -100,6 +115,8 @@ impl ObjectJudge {
             fg_ari: self.ari.value(),
             covered: self.covered.value(),
             velocity_error_mps: self.velocity.value(),
+            acceleration_error_mps2: self.acceleration.value(),
+            no_acceleration_error_mps2: self.no_acceleration.value(),
             road_users: self.followed.len(),
             switches_each: self.followed.values().map(|f| f.2).sum::<usize>() as f64 / n,
             objects_each: self.followed.values().map(|f| f.1.len()).sum::<usize>() as f64 / n,

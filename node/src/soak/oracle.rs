@@ -34,6 +34,9 @@ pub struct OracleErrors {
     pub velocity_mps: f64,
     /// Chance that a road user is taken for standing, per picture.
     pub missed: f64,
+    /// Part of the ego motion that is taken for the scene's: standard deviation over windows and their pictures' moments,
+    /// as a part of how fast a standing surface moves past the vehicle.
+    pub ego_leak: f64,
 }
 
 /// One synchronized set: pictures with truth, and their Gaussians in map axes relative to `place`.
@@ -45,8 +48,18 @@ pub struct OracleSet {
     /// map_from_camera, per camera.
     pub poses: Vec<Rigid>,
     place: DVec3,
+    /// The vehicle's velocity (m/s) and turn (rad/s), map axes.
+    ego: (DVec3, DVec3),
     gaussians: Gaussians,
     depths: Vec<f32>,
+}
+
+/// A vehicle's velocity and turn at a time, from its poses a little before and after.
+fn ego_motion(drive: &Drive, time_sec: f64) -> (DVec3, DVec3) {
+    const APART_SEC: f64 = 0.02;
+    let (a, b) = (drive.map_from_base(time_sec - APART_SEC), drive.map_from_base(time_sec + APART_SEC));
+    let turn = glam::DQuat::from_mat3(&(b.matrix3 * a.matrix3.transpose())).to_scaled_axis();
+    ((b.translation - a.translation) / (2.0 * APART_SEC), turn / (2.0 * APART_SEC))
 }
 
 /// Draws a number in 0..1 for a place in the drive; the same for the same place.
@@ -72,7 +85,9 @@ impl OracleSet {
         let poses: Vec<Rigid> = cameras.iter().map(|c| Rigid::from(&(base * c.base_from_camera))).collect();
         let frames: Vec<WorldFrame> = (0..cameras.len()).map(|c| drive.render(c, time_sec)).collect();
         let place = base.translation;
-        let mut set = Self { time_sec, frames, poses, place, gaussians: Gaussians::default(), depths: Vec::new() };
+        let ego = if errors.ego_leak > 0.0 { ego_motion(drive, time_sec) } else { (DVec3::ZERO, DVec3::ZERO) };
+        let (gaussians, depths) = (Gaussians::default(), Vec::new());
+        let mut set = Self { time_sec, frames, poses, place, ego, gaussians, depths };
         set.gaussians.motion_count = TOKENS;
         for c in 0..cameras.len() {
             set.picture(drive, c, errors);
@@ -153,6 +168,18 @@ impl OracleSet {
         }
     }
 
+    /// Memory held, bytes.
+    pub fn bytes(&self) -> usize {
+        let g = &self.gaussians;
+        let frames: usize = self
+            .frames
+            .iter()
+            .map(|f| size_of_val(&f.rgb[..]) + size_of_val(&f.depth[..]) + size_of_val(&f.flow[..]))
+            .sum();
+        // Means, scales, colours and two velocities of three numbers, four of rotation, one opacity.
+        frames + g.len() * (20 + g.motion_count) * size_of::<f32>() + self.depths.capacity() * size_of::<f32>()
+    }
+
     /// Stamp, nanoseconds.
     pub fn stamp_ns(&self) -> i64 {
         (self.time_sec * 1e9).round() as i64
@@ -165,6 +192,8 @@ pub struct OracleWindow {
     stride: usize,
     timesteps: usize,
     reference: usize,
+    /// Of [`OracleErrors`], and the drive's seed.
+    ego_leak: (f64, u64),
     config: Arc<ModelConfig>,
 }
 
@@ -181,10 +210,11 @@ pub struct OracleStep {
 }
 
 impl OracleWindow {
-    /// Windows of `timesteps` sets, `stride` sets apart, anchored at camera `reference`.
-    pub fn new(timesteps: usize, stride: usize, reference: usize) -> Result<Self> {
+    /// Windows of `timesteps` sets, `stride` sets apart, anchored at camera `reference`. `ego_leak`: see
+    /// [`OracleErrors`], and a seed.
+    pub fn new(timesteps: usize, stride: usize, reference: usize, ego_leak: (f64, u64)) -> Result<Self> {
         let config = ModelConfig::preset("tiny").context("the preset tiny")?;
-        Ok(Self { sets: VecDeque::new(), stride, timesteps, reference, config: Arc::new(config) })
+        Ok(Self { sets: VecDeque::new(), stride, timesteps, reference, ego_leak, config: Arc::new(config) })
     }
 
     /// Takes the next set; a window once there are enough.
@@ -195,6 +225,32 @@ impl OracleWindow {
             self.sets.pop_front();
         }
         (self.sets.len() == span).then(|| self.step())
+    }
+
+    /// Gives standing surfaces a part of the vehicle's own motion, another part in every window and at every moment, and
+    /// no two pixels quite the same.
+    fn leak(&self, sets: &[&OracleSet], g: &mut Gaussians, anchor_from_map: &Mat3) {
+        let (sigma, seed) = self.ego_leak;
+        let newest = sets.last().map_or(0, |s| s.stamp_ns()) as u64;
+        let mut i = 0;
+        for (t, set) in sets.iter().enumerate() {
+            let part = (sigma * normal(seed, [newest, 31, t as u64])) as f32;
+            let (velocity, turn) = (set.ego.0.as_vec3(), set.ego.1.as_vec3());
+            for place in &set.gaussians.means {
+                if g.velocity_forward[i] == [0.0; 3] && g.opacities[i] > 0.0 {
+                    let uneven = 0.7 + 0.6 * chance(seed, [newest, 32, i as u64]) as f32;
+                    let passing = velocity + turn.cross(Vec3::from(*place));
+                    let v = *anchor_from_map * passing * (part * uneven);
+                    (g.velocity_forward[i], g.velocity_backward[i]) = (v.to_array(), v.to_array());
+                }
+                i += 1;
+            }
+        }
+    }
+
+    /// Memory of the sets that wait, bytes.
+    pub fn bytes(&self) -> usize {
+        self.sets.iter().map(|s| s.bytes()).sum()
     }
 
     fn step(&self) -> OracleStep {
@@ -232,6 +288,9 @@ impl OracleWindow {
             height: frame.height,
             width: frame.width,
         };
+        if self.ego_leak.0 > 0.0 {
+            self.leak(&sets, &mut g, &r);
+        }
         let scene = Scene {
             gaussians: g,
             shape,

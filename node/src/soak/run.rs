@@ -15,10 +15,13 @@ use crate::config::Config;
 use crate::engine::select;
 use crate::map::{MapCounts, SceneLook, StaticMap};
 use crate::objects::{ObjectCounts, ObjectTracker};
+use crate::overlap::{Overlap, OverlapCounts, OverlapLook};
 use crate::pipeline::timing::{cpu_ms, rss_mb};
 use crate::tracks::{TrackCounts, Tracker};
 
 use super::map_quality::{MapFigures, MapJudge, ever_moving};
+use super::memory::Memory;
+use super::motion_quality::{MotionFigures, MotionJudge};
 use super::object_quality::{ObjectFigures, ObjectJudge};
 use super::oracle::{OracleErrors, OracleSet, OracleStep, OracleWindow};
 use super::track_quality::{TrackFigures, TrackJudge};
@@ -58,12 +61,41 @@ pub struct Quarter {
     pub fuse_ms: Spread,
     /// Trajectories.
     pub track_ms: Spread,
-    /// Both together.
+    /// Comparing overlapping windows.
+    pub overlap_ms: Spread,
+    /// All three together.
     pub step_ms: Spread,
     /// Mean and largest resident memory, MB.
     pub rss_mb: [f64; 2],
-    /// Map Gaussians in memory and on disk at its end.
+    /// Map Gaussians in memory, and those on disk alone, at its end.
     pub map_gaussians: [usize; 2],
+    /// Where memory is at its end.
+    pub memory_mb: Memory,
+}
+
+/// What the last quarter has more than the second, as a part: 0.02 is 2 %.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct Growth {
+    /// Of mean resident memory.
+    pub resident: f64,
+    /// Of a step's 99th percentile, wall time.
+    pub step_p99: f64,
+    /// Of a step's 99th percentile, processor time.
+    pub step_cpu_p99: f64,
+}
+
+impl Growth {
+    fn of(quarters: &[Quarter]) -> Self {
+        let more = |of: &dyn Fn(&Quarter) -> f64| match quarters {
+            [_, second, _, last] if of(second) > 0.0 => of(last) / of(second) - 1.0,
+            _ => 0.0,
+        };
+        Self {
+            resident: more(&|q| q.rss_mb[0]),
+            step_p99: more(&|q| q.step_ms.p99),
+            step_cpu_p99: more(&|q| q.step_ms.cpu_p99),
+        }
+    }
 }
 
 /// What a soak found.
@@ -87,6 +119,12 @@ pub struct SoakReport {
     pub fuse_ms: Spread,
     /// Trajectories, over all.
     pub track_ms: Spread,
+    /// Comparing overlapping windows, over all.
+    pub overlap_ms: Spread,
+    /// What overlapping windows said of each other.
+    pub overlap: OverlapCounts,
+    /// Last quarter against the second: mean resident memory, and 99th percentile of a step's processor time.
+    pub growth: Growth,
     /// The four quarters.
     pub quarters: Vec<Quarter>,
     /// What became of the Gaussians.
@@ -108,6 +146,9 @@ pub struct SoakReport {
     /// The map against the truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub map_quality: Option<MapFigures>,
+    /// What is said to move against the truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub motion_quality: Option<MotionFigures>,
     /// The trajectories against the truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub track_quality: Option<TrackFigures>,
@@ -120,6 +161,7 @@ pub struct SoakReport {
 #[derive(Debug, Clone, Copy, Default)]
 struct Times {
     fuse: [f64; 2],
+    overlap: [f64; 2],
     track: [f64; 2],
     objects: [f64; 2],
     rss_mb: f64,
@@ -147,14 +189,16 @@ fn spread(times: &[Times], of: impl Fn(&Times) -> [f64; 2]) -> Spread {
     Spread { p50: at(&wall, 0.5), p99: at(&wall, 0.99), cpu_p50: at(&cpu, 0.5), cpu_p99: at(&cpu, 0.99) }
 }
 
-fn quarter(times: &[Times]) -> Quarter {
+fn quarter(times: &[Times], memory_mb: Memory) -> Quarter {
     let n = times.len().max(1) as f64;
     Quarter {
         fuse_ms: spread(times, |t| t.fuse),
         track_ms: spread(times, |t| t.track),
-        step_ms: spread(times, |t| [t.fuse[0] + t.track[0], t.fuse[1] + t.track[1]]),
+        overlap_ms: spread(times, |t| t.overlap),
+        step_ms: spread(times, |t| [0, 1].map(|k| t.fuse[k] + t.overlap[k] + t.track[k])),
         rss_mb: [times.iter().map(|t| t.rss_mb).sum::<f64>() / n, times.iter().map(|t| t.rss_mb).fold(0.0, f64::max)],
         map_gaussians: times.last().map_or([0; 2], |t| t.map),
+        memory_mb,
     }
 }
 
@@ -170,7 +214,8 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
     let config = &options.config;
     let stride = ((config.window.stride_sec * options.drive.rate_hz).round() as usize).max(1);
     let reference = if options.drive.cameras >= 3 { 1 } else { 0 };
-    let mut windows = OracleWindow::new(config.window.timesteps, stride, reference)?;
+    let ego_leak = (options.errors.ego_leak, options.drive.seed);
+    let mut windows = OracleWindow::new(config.window.timesteps, stride, reference, ego_leak)?;
     let mut map = match &options.map_dir {
         Some(dir) => StaticMap::in_folder(&config.map, dir)?,
         None => StaticMap::new(&config.map),
@@ -180,6 +225,8 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
         .then(|| Tagged { map: StaticMap::new(&config.map), moving: ever_moving(&drive, options.drive.seconds) });
     let mut tracker = Tracker::new(&config.tracks);
     let mut objects = ObjectTracker::new(&config.objects);
+    let mut overlap = Overlap::new(&config.overlap);
+    let mut motion_judge = options.quality.then(MotionJudge::default);
     let mut object_judge = options.quality.then(ObjectJudge::default);
     let mut map_judge: Option<MapJudge> = None;
     let mut track_judge = options.quality.then(|| TrackJudge::new(&drive));
@@ -187,6 +234,7 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
     let sets = drive.frame_count();
     let (mut times, mut recent) = (Vec::with_capacity(sets), std::collections::VecDeque::new());
     let (mut live_tracks, mut gaussians) = (0, 0);
+    let (all_steps, mut memory) = (sets.saturating_sub((config.window.timesteps - 1) * stride), Vec::new());
     // A held-out pose every two seconds: enough of them to judge, few enough to draw.
     let every = ((2.0 * options.drive.rate_hz) as usize).max(1);
     for frame in 0..sets {
@@ -195,7 +243,22 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
         if recent.len() > stride * config.window.timesteps {
             recent.pop_front();
         }
-        let Some(step) = windows.push(set.clone()) else { continue };
+        let Some(mut step) = windows.push(set.clone()) else { continue };
+        let newest = config.window.timesteps - 1;
+        let as_given = motion_judge.is_some().then(|| step.scene.clone());
+        let stamps_ns: Vec<i64> =
+            (0..=newest).map(|t| recent[recent.len() - 1 - (newest - t) * stride].stamp_ns()).collect();
+        let overlapping = OverlapLook {
+            stamps_ns: &stamps_ns,
+            epoch: 0,
+            map_from_anchor: &step.map_from_anchor,
+            cameras: &cameras,
+            poses: &step.poses,
+        };
+        let (agreement, overlap_ms) = timed(|| overlap.step(&mut step.scene, &overlapping));
+        if let (Some(judge), Some(as_given)) = (&mut motion_judge, &as_given) {
+            judge.step(&set, as_given, &step.scene);
+        }
         let look = SceneLook {
             stamp_ns: set.stamp_ns(),
             map_from_anchor: &step.map_from_anchor,
@@ -203,6 +266,7 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
             cameras: &cameras,
             poses: &step.poses,
             rendered: &[],
+            confidence: &agreement.geometry,
             first_new: if times.is_empty() { 0 } else { config.window.timesteps - 1 },
         };
         let (_, fuse) = timed(|| map.fuse_scene(&look));
@@ -210,7 +274,6 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
             let scene = tag(&step, &recent, stride, &tagged.moving);
             tagged.map.fuse_scene(&SceneLook { scene: &scene, ..look });
         }
-        let newest = config.window.timesteps - 1;
         let points = select::moving_points(&step.scene, newest, &step.map_from_anchor, &config.tracks);
         let (_, track) = timed(|| tracker.step(set.stamp_ns(), 0, &points));
         live_tracks = live_tracks.max(tracker.live().len());
@@ -226,7 +289,31 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
         }
         drop(objects.drain());
         let loaded = map.loaded();
-        times.push(Times { fuse, track, objects: object_ms, rss_mb: rss_mb().unwrap_or(0.0), map: [loaded, 0] });
+        let rss_mb = rss_mb().unwrap_or(0.0);
+        times.push(Times {
+            fuse,
+            overlap: overlap_ms,
+            track,
+            objects: object_ms,
+            rss_mb,
+            map: [loaded, map.len() - loaded],
+        });
+        if 4 * times.len() >= (memory.len() + 1) * all_steps {
+            let mb = |bytes: usize| bytes as f64 / 1e6;
+            memory.push(
+                Memory {
+                    tiles: mb(map.bytes()),
+                    map_side: mb(map.side_bytes()),
+                    tracks: mb(tracker.bytes()),
+                    objects: mb(objects.bytes()),
+                    overlap: mb(overlap.bytes()),
+                    sets: mb(windows.bytes()),
+                    measurements: mb(times.len() * size_of::<Times>()),
+                    ..Memory::default()
+                }
+                .of_process(),
+            );
+        }
         if options.quality && frame.is_multiple_of(every) {
             let judge = match &mut map_judge {
                 Some(judge) => judge,
@@ -250,6 +337,8 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
         map.save().context("the map could not be saved")?;
     }
     let n = times.len();
+    let memory_at = |q: usize| memory.get(q).copied().unwrap_or_default();
+    let quarters: Vec<Quarter> = (0..4).map(|q| quarter(&times[q * n / 4..(q + 1) * n / 4], memory_at(q))).collect();
     let metres = (0..sets)
         .map(|i| drive.map_from_base(drive.frame_time_sec(i, 0)).translation)
         .collect::<Vec<_>>()
@@ -266,7 +355,10 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
         threads: rayon::current_num_threads(),
         fuse_ms: spread(&times, |t| t.fuse),
         track_ms: spread(&times, |t| t.track),
-        quarters: (0..4).map(|q| quarter(&times[q * n / 4..(q + 1) * n / 4])).collect(),
+        overlap_ms: spread(&times, |t| t.overlap),
+        overlap: overlap.counts(),
+        growth: Growth::of(&quarters),
+        quarters,
         map: map.counts(),
         map_gaussians: map.len(),
         map_mb: map.bytes() as f64 / 1e6,
@@ -276,6 +368,7 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
         map_quality,
         object_ms: spread(&times, |t| t.objects),
         objects: objects.counts(),
+        motion_quality: motion_judge.map(MotionJudge::finish),
         object_quality: object_judge.map(ObjectJudge::finish),
         track_quality: track_judge.map(TrackJudge::finish).transpose()?,
     })

@@ -1,4 +1,5 @@
-//! Trajectories against the truth: the figures of TAPVid-3D, beside constant velocity from the start.
+//! Trajectories against the truth: the figures of TAPVid-3D, beside constant velocity from the start and beside points
+//! that follow the true flow of whatever is seen at their place.
 //!
 //! A trajectory starts on a road user; where that point of it is later follows from the road user's pose. (Limbs and
 //! wheels move by themselves; what they add is counted as error for every method alike.)
@@ -34,6 +35,10 @@ struct Truth {
     velocity: DVec3,
     alive_sec: f64,
     stamps: usize,
+    /// Where the true flow has taken it, when, and the last flow.
+    flowed: DVec3,
+    flowed_sec: f64,
+    flow: DVec3,
 }
 
 /// How good the trajectories are.
@@ -47,6 +52,8 @@ pub struct TrackFigures {
     pub tracks: TrackScores,
     /// The same points moved on at the velocity of their first flow.
     pub constant_velocity: TrackScores,
+    /// The same points chained by the true flow at the pixel they are seen at, by the last one while they are hidden.
+    pub oracle_flow: TrackScores,
     /// Trajectories whose end lies in another road user's box than their start.
     pub switches: usize,
     /// Mean life, seconds.
@@ -63,6 +70,7 @@ pub struct TrackJudge {
     truths: HashMap<u32, Option<Truth>>,
     own: Vec<TrackPoint>,
     steady: Vec<TrackPoint>,
+    flowed: Vec<TrackPoint>,
     switches: std::collections::HashSet<u32>,
     velocity_errors: (f64, usize),
 }
@@ -80,6 +88,7 @@ impl TrackJudge {
             truths: HashMap::new(),
             own: Vec::new(),
             steady: Vec::new(),
+            flowed: Vec::new(),
             switches: std::collections::HashSet::new(),
             velocity_errors: (0.0, 0),
         }
@@ -91,7 +100,7 @@ impl TrackJudge {
         let by_id: HashMap<u64, &Mover> = movers.iter().map(|m| (m.id, m)).collect();
         let views: Vec<(Rigid, usize)> = set.poses.iter().enumerate().map(|(c, p)| (p.inverse(), c)).collect();
         for track in live {
-            let Some(end) = track.points.last() else { continue };
+            let end = track.end();
             let seen_now = end.stamp_ns == set.stamp_ns();
             if track.len() == 1 && seen_now {
                 let mover = movers.iter().find(|m| inside(m, end.position_map));
@@ -103,6 +112,12 @@ impl TrackJudge {
                     velocity: end.velocity_map_mps,
                     alive_sec: 0.0,
                     stamps: 0,
+                    flowed: end.position_map,
+                    flowed_sec: set.time_sec,
+                    flow: views
+                        .iter()
+                        .find_map(|(to, c)| true_flow(drive, set, *c, to, end.position_map))
+                        .unwrap_or(end.velocity_map_mps),
                 });
                 self.truths.insert(track.id, truth);
                 continue;
@@ -128,13 +143,18 @@ impl TrackJudge {
             // In the camera that sees the true point, else in the first.
             let (camera, visible) = views
                 .iter()
-                .find_map(|(camera_from_map, c)| sees(drive, set, *c, camera_from_map, here).then_some((*c, true)))
+                .find_map(|(camera_from_map, c)| sees(drive, set, *c, camera_from_map, here).map(|_| (*c, true)))
                 .unwrap_or((0, false));
             let place = |p: DVec3| views[camera].0.apply(p).as_vec3().to_array();
             let point = TrackPoint { pred: place(coasted), truth: place(here), pred_visible: seen_now, visible };
             self.own.push(point);
             let steady = truth.start + truth.velocity * since_sec;
             self.steady.push(TrackPoint { pred: place(steady), ..point });
+            truth.flowed += truth.flow * (set.time_sec - truth.flowed_sec);
+            truth.flowed_sec = set.time_sec;
+            let flow = views.iter().find_map(|(to, c)| true_flow(drive, set, *c, to, truth.flowed));
+            truth.flow = flow.unwrap_or(truth.flow);
+            self.flowed.push(TrackPoint { pred: place(truth.flowed), pred_visible: flow.is_some(), ..point });
         }
     }
 
@@ -148,6 +168,7 @@ impl TrackJudge {
             astray: self.truths.values().filter(|t| t.is_none()).count(),
             tracks: track_scores(&self.own, self.focal_px)?,
             constant_velocity: track_scores(&self.steady, self.focal_px)?,
+            oracle_flow: track_scores(&self.flowed, self.focal_px)?,
             switches: self.switches.len(),
             mean_life_sec: judged.iter().map(|t| t.alive_sec).sum::<f64>() / n,
             per_mover: judged.len() as f64 / movers.len().max(1) as f64,
@@ -156,11 +177,20 @@ impl TrackJudge {
     }
 }
 
-fn sees(drive: &Drive, set: &OracleSet, camera: usize, camera_from_map: &Rigid, p: DVec3) -> bool {
+/// The pixel a camera sees a place at, if nothing hides it.
+fn sees(drive: &Drive, set: &OracleSet, camera: usize, camera_from_map: &Rigid, p: DVec3) -> Option<usize> {
     let p: Vec3 = camera_from_map.apply(p).as_vec3();
     let k = drive.cameras()[camera].intrinsics;
-    let Some((u, v)) = k.project(p) else { return false };
+    let (u, v) = k.project(p)?;
     let inside = u >= 0.0 && v >= 0.0 && u < k.width as f32 && v < k.height as f32;
-    let depth = || set.frames[camera].depth[v as usize * k.width + u as usize];
-    inside && depth() > 0.0 && depth() > p.z - SEEN_M - SEEN_PART * p.z
+    let pixel = || v as usize * k.width + u as usize;
+    let depth = || set.frames[camera].depth[pixel()];
+    (inside && depth() > 0.0 && depth() > p.z - SEEN_M - SEEN_PART * p.z).then(pixel)
+}
+
+/// The true flow of the moving surface a camera sees at a place, map axes, m/s.
+fn true_flow(drive: &Drive, set: &OracleSet, camera: usize, camera_from_map: &Rigid, p: DVec3) -> Option<DVec3> {
+    let pixel = sees(drive, set, camera, camera_from_map, p)?;
+    let frame = &set.frames[camera];
+    (frame.moving[pixel] > 0).then(|| Vec3::from(frame.flow[pixel]).as_dvec3())
 }

@@ -90,7 +90,7 @@ impl Subject {
 
     /// The f32 network on the drive's own window, keeping what `stages` asks for.
     pub fn stages(&self, stages: &mut Stages) -> Result<()> {
-        let batch = self.engine.batch(&self.plain_window()?, &self.cameras)?;
+        let batch = self.engine.clip(&self.plain_window()?, &self.cameras)?;
         Storm::new(&self.config, &self.tensors)?.forward_stages(&batch, stages)?;
         Ok(())
     }
@@ -119,7 +119,7 @@ impl Subject {
 
     /// The network in f32 against f64 on one window.
     pub fn compare(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Finding {
-        let batch = match self.engine.batch(window, cameras) {
+        let batch = match self.engine.clip(window, cameras) {
             Ok(batch) => batch,
             Err(e) => return refused(&e),
         };

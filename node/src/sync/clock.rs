@@ -90,7 +90,10 @@ pub(crate) fn signed_ns(sec: f64) -> i64 {
 
 /// `later - earlier` in seconds, exact in the integers whatever the size of the stamps.
 pub(crate) fn seconds_between(earlier_ns: i64, later_ns: i64) -> f64 {
-    (i128::from(later_ns) - i128::from(earlier_ns)) as f64 * 1e-9
+    match later_ns.checked_sub(earlier_ns) {
+        Some(ns) => ns as f64 * 1e-9,
+        None => (i128::from(later_ns) - i128::from(earlier_ns)) as f64 * 1e-9,
+    }
 }
 
 #[cfg(test)]

@@ -11,7 +11,11 @@ mod nearest;
 mod spacing;
 mod track;
 
+use std::borrow::Cow;
+
+#[cfg(test)]
 use glam::DVec3;
+use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::config::TracksConfig;
@@ -22,6 +26,12 @@ pub use track::{Track, TrackPoint, TrackSample};
 
 /// Speeds beyond this are a mistake of the network, m/s; the Gaussian is left out and counted.
 const MAX_SPEED_MPS: f64 = 200.0;
+
+/// Trajectories or points one task takes at least: fewer are not worth a thread.
+const MIN_TRACKS: usize = 1024;
+
+/// No point.
+const NONE: u32 = u32::MAX;
 
 /// What became of points and trajectories.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
@@ -75,25 +85,18 @@ impl Tracker {
             return;
         }
         self.stamp_ns = stamp_ns;
-        let usable: Vec<TrackPoint> = points.iter().copied().filter(plausible).collect();
+        let usable = usable(points);
         self.counts.rejected += (points.len() - usable.len()) as u64;
 
-        let predicted: Vec<DVec3> = self.live.iter().filter_map(|t| t.predicted(stamp_ns)).collect();
-        let gates_m: Vec<f64> = self.live.iter().map(|t| t.gate_m(stamp_ns, &self.config)).collect();
-        let observed: Vec<DVec3> = usable.iter().map(|p| p.position_map).collect();
-        let continued = mutual_nearest(&predicted, &gates_m, &observed, self.config.gate_m);
-        for (point, track) in usable.iter().zip(&continued) {
-            if let Some(track) = track.and_then(|i| self.live.get_mut(i)) {
-                if track.looks_like(point, &self.config) {
-                    track.go_on(stamp_ns, point);
-                    self.counts.continued += 1;
-                } else {
-                    self.counts.unlike += 1;
-                }
-            }
-        }
+        let (live, config) = (&self.live, &self.config);
+        let continued = mutual_nearest(
+            (live.len(), |i| (live[i].predicted(stamp_ns), live[i].gate_m(stamp_ns, config))),
+            (usable.len(), |j| usable[j].position_map),
+            config.gate_m,
+        );
+        self.go_on(stamp_ns, &usable, &continued);
         let bridge_sec = self.config.bridge_sec;
-        self.end_where(|t| t.points.last().map_or(0.0, |p| seconds_between(p.stamp_ns, stamp_ns)) > bridge_sec);
+        self.end_where(|t| seconds_between(t.end().stamp_ns, stamp_ns) > bridge_sec);
         if self.config.min_points <= track::PIECE_POINTS {
             self.finished.extend(self.live.iter_mut().filter_map(Track::cut));
         }
@@ -123,6 +126,40 @@ impl Tracker {
         self.counts
     }
 
+    /// Takes each point into the trajectory it continues, if it looks like it.
+    fn go_on(&mut self, stamp_ns: i64, points: &[TrackPoint], continued: &[Option<usize>]) {
+        let mut next = vec![NONE; self.live.len()];
+        for (j, track) in continued.iter().enumerate() {
+            if let Some(slot) = track.and_then(|i| next.get_mut(i)) {
+                *slot = j as u32;
+            }
+        }
+        let config = &self.config;
+        let took = |(track, j): (&mut Track, &u32)| match points.get(*j as usize) {
+            Some(point) if track.looks_like(point, config) => {
+                track.go_on(stamp_ns, point);
+                (1, 0)
+            }
+            Some(_) => (0, 1),
+            None => (0, 0),
+        };
+        let (taken, unlike) = self
+            .live
+            .par_iter_mut()
+            .zip(&next)
+            .with_min_len(MIN_TRACKS)
+            .map(took)
+            .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+        self.counts.continued += taken;
+        self.counts.unlike += unlike;
+    }
+
+    /// Memory held, bytes.
+    pub fn bytes(&self) -> usize {
+        let lists: usize = self.live.iter().chain(&self.finished).map(Track::bytes).sum();
+        lists + (self.live.capacity() + self.finished.capacity()) * size_of::<Track>()
+    }
+
     /// Starts trajectories at the points that continue none, the most opaque first.
     fn start(&mut self, stamp_ns: i64, points: &[TrackPoint], continued: &[Option<usize>]) {
         let Some(origin) = points.first().map(|p| p.position_map) else { return };
@@ -135,9 +172,13 @@ impl Tracker {
         if candidates.is_empty() {
             return;
         }
+        if self.live.len() >= self.config.max_active {
+            self.counts.no_room += candidates.len() as u64;
+            return;
+        }
         let about = self.live.len() + candidates.len();
         let mut taken = Spacing::new(self.config.spacing_m, origin, about);
-        self.live.iter().filter_map(|t| t.predicted(stamp_ns)).for_each(|p| taken.add(p));
+        self.live.iter().for_each(|t| taken.add(t.predicted(stamp_ns)));
         // Stable, so points equally opaque stay in the caller's order.
         candidates.sort_by(|a, b| b.opacity.total_cmp(&a.opacity));
         for p in candidates {
@@ -164,10 +205,20 @@ impl Tracker {
     }
 }
 
+/// The points without those that make no sense; mostly all of them.
+fn usable(points: &[TrackPoint]) -> Cow<'_, [TrackPoint]> {
+    if points.par_iter().with_min_len(MIN_TRACKS).all(plausible) {
+        return Cow::Borrowed(points);
+    }
+    Cow::Owned(points.iter().copied().filter(plausible).collect())
+}
+
 fn plausible(p: &TrackPoint) -> bool {
     let finite = p.position_map.is_finite() && p.velocity_map_mps.is_finite() && p.opacity.is_finite();
     let finite = finite && p.color01.iter().chain([&p.distance_m]).all(|x| x.is_finite());
-    finite && p.velocity_map_mps.length() <= MAX_SPEED_MPS && p.position_map.length() <= crate::poses::MAX_POSITION_M
+    finite
+        && p.velocity_map_mps.length_squared() <= MAX_SPEED_MPS * MAX_SPEED_MPS
+        && p.position_map.length() <= crate::poses::MAX_POSITION_M
 }
 
 #[cfg(test)]

@@ -1,52 +1,55 @@
 //! Keeping new trajectories apart from all others.
 
-use std::collections::HashMap;
-
 use glam::DVec3;
 
-use crate::map::VoxelHash;
-
-/// No further place in a cube.
+/// No further place.
 const END: u32 = u32::MAX;
 
 /// A set of places, at least `spacing_m` apart as far as they were added through [`Spacing::claim`].
 pub(super) struct Spacing {
-    spacing_m: f64,
+    inverse_m: f64,
+    limit2: f64,
     origin: DVec3,
-    /// Per cube of the spacing's edge, its newest place.
-    newest: HashMap<[i32; 3], u32, VoxelHash>,
-    /// Places, and the one before in the same cube.
+    /// Per hash of a cube of the spacing's edge its newest place; a power of two of them. Cubes may share one.
+    newest: Vec<u32>,
+    /// Places, and the one before of the same hash.
     places: Vec<(DVec3, u32)>,
 }
 
 impl Spacing {
     /// `about` is how many places there will be, roughly.
     pub fn new(spacing_m: f64, origin: DVec3, about: usize) -> Self {
-        let newest = HashMap::with_capacity_and_hasher(about, VoxelHash::default());
-        Self { spacing_m, origin, newest, places: Vec::with_capacity(about) }
+        let newest = vec![END; (2 * about).next_power_of_two()];
+        let places = Vec::with_capacity(about);
+        Self { inverse_m: 1.0 / spacing_m, limit2: spacing_m * spacing_m, origin, newest, places }
     }
 
-    fn key(&self, p: DVec3) -> [i32; 3] {
+    fn cube(&self, p: DVec3) -> [i32; 3] {
         // `as` saturates: places far outside share a cube, which is slower and no less right.
-        ((p - self.origin) / self.spacing_m).floor().to_array().map(|x| (x as i32).clamp(i32::MIN + 1, i32::MAX - 1))
+        ((p - self.origin) * self.inverse_m).floor().to_array().map(|x| x as i32)
+    }
+
+    fn hash(&self, [x, y, z]: [i32; 3]) -> usize {
+        let mixed = (x as u32).wrapping_mul(0x9e37_79b1)
+            ^ (y as u32).wrapping_mul(0x85eb_ca77)
+            ^ (z as u32).wrapping_mul(0xc2b2_ae3d);
+        mixed as usize & (self.newest.len() - 1)
     }
 
     /// Adds a place, near others or not.
     pub fn add(&mut self, p: DVec3) {
-        let at = self.places.len() as u32;
-        let before = self.newest.insert(self.key(p), at).unwrap_or(END);
-        self.places.push((p, before));
+        let (at, hash) = (self.places.len() as u32, self.hash(self.cube(p)));
+        self.places.push((p, std::mem::replace(&mut self.newest[hash], at)));
     }
 
     /// Adds a place if none added before is nearer than the spacing; true if it was.
     pub fn claim(&mut self, p: DVec3) -> bool {
-        let [x, y, z] = self.key(p);
-        let limit2 = self.spacing_m * self.spacing_m;
+        let [x, y, z] = self.cube(p);
         for i in 0..27 {
-            let near = [x + i / 9 - 1, y + i / 3 % 3 - 1, z + i % 3 - 1];
-            let mut next = self.newest.get(&near).copied().unwrap_or(END);
+            let near = [x.wrapping_add(i / 9 - 1), y.wrapping_add(i / 3 % 3 - 1), z.wrapping_add(i % 3 - 1)];
+            let mut next = self.newest[self.hash(near)];
             while let Some((q, before)) = self.places.get(next as usize) {
-                if q.distance_squared(p) < limit2 {
+                if q.distance_squared(p) < self.limit2 {
                     return false;
                 }
                 next = *before;

@@ -57,33 +57,46 @@ pub struct Track {
     pub points: Vec<TrackSample>,
     /// Points handed out in earlier pieces.
     pub earlier: usize,
+    /// The last point, here as well: every step asks every trajectory for it, and a list of its own is far away.
+    end: TrackSample,
     color01: Vec3,
     speed_sigma_mps: f64,
     distance_m: f64,
 }
 
+/// Room for points at the start. Different for different trajectories, so that those born together do not all need more
+/// in the same step.
+const FIRST_POINTS: usize = 8;
+
 impl Track {
     pub(super) fn new(id: u32, stamp_ns: i64, p: &TrackPoint) -> Self {
+        let mut points = Vec::with_capacity(FIRST_POINTS + id as usize % FIRST_POINTS);
+        points.push(sample(stamp_ns, p));
         Self {
             id,
-            points: vec![sample(stamp_ns, p)],
+            points,
             earlier: 0,
+            end: sample(stamp_ns, p),
             color01: p.color01.into(),
             speed_sigma_mps: NEW_SPEED_SIGMA_MPS,
             distance_m: f64::from(p.distance_m),
         }
     }
 
-    /// Where its end is at `stamp_ns`, moved by its own flow; none for a track without points (there are none).
-    pub(super) fn predicted(&self, stamp_ns: i64) -> Option<DVec3> {
-        let end = self.points.last()?;
-        Some(end.position_map + end.velocity_map_mps * seconds_between(end.stamp_ns, stamp_ns))
+    /// Its last point.
+    pub fn end(&self) -> &TrackSample {
+        &self.end
+    }
+
+    /// Where its end is at `stamp_ns`, moved by its own flow.
+    pub(super) fn predicted(&self, stamp_ns: i64) -> DVec3 {
+        self.end.position_map + self.end.velocity_map_mps * seconds_between(self.end.stamp_ns, stamp_ns)
     }
 
     /// How far from there its Gaussian may be at `stamp_ns`, metres: farther where its speed is not known well, and
     /// far from the camera, where pixels and depth errors are larger.
     pub(super) fn gate_m(&self, stamp_ns: i64, config: &TracksConfig) -> f64 {
-        let unseen_sec = self.points.last().map_or(0.0, |p| seconds_between(p.stamp_ns, stamp_ns)).max(0.0);
+        let unseen_sec = seconds_between(self.end.stamp_ns, stamp_ns).max(0.0);
         let gate = config.gate_m + config.gate_per_m * self.distance_m + self.speed_sigma_mps * unseen_sec;
         gate.min(config.max_gate_m.max(config.gate_m))
     }
@@ -96,18 +109,17 @@ impl Track {
 
     /// Continues at a Gaussian.
     pub(super) fn go_on(&mut self, stamp_ns: i64, p: &TrackPoint) {
-        if let (Some(predicted), Some(end)) = (self.predicted(stamp_ns), self.points.last()) {
-            let dt_sec = seconds_between(end.stamp_ns, stamp_ns);
-            if dt_sec > 0.0 {
-                let off = (p.position_map - predicted).length() / dt_sec;
-                let squared = self.speed_sigma_mps.powi(2);
-                let learned = (squared + LEARN * (off * off - squared)).sqrt();
-                self.speed_sigma_mps = learned.clamp(*SPEED_SIGMA_MPS.start(), *SPEED_SIGMA_MPS.end());
-            }
+        let dt_sec = seconds_between(self.end.stamp_ns, stamp_ns);
+        if dt_sec > 0.0 {
+            let off = (p.position_map - self.predicted(stamp_ns)).length() / dt_sec;
+            let squared = self.speed_sigma_mps.powi(2);
+            let learned = (squared + LEARN * (off * off - squared)).sqrt();
+            self.speed_sigma_mps = learned.clamp(*SPEED_SIGMA_MPS.start(), *SPEED_SIGMA_MPS.end());
         }
         self.color01 += LEARN as f32 * (Vec3::from(p.color01) - self.color01);
         self.distance_m = f64::from(p.distance_m);
-        self.points.push(sample(stamp_ns, p));
+        self.end = sample(stamp_ns, p);
+        self.points.push(self.end);
     }
 
     /// All points but the last as a piece of their own, once there are enough.
@@ -120,6 +132,11 @@ impl Track {
         let piece = Self { points, ..self.clone() };
         self.earlier += piece.points.len();
         Some(piece)
+    }
+
+    /// Memory of its points, bytes.
+    pub(super) fn bytes(&self) -> usize {
+        self.points.capacity() * size_of::<TrackSample>()
     }
 
     /// Points so far, those handed out included.

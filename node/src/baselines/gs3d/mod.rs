@@ -36,14 +36,17 @@ pub struct Target {
     pub exposure: Affine,
 }
 
-/// Optimises `params` in place and gives the loss of every iteration. `tick` hears the number of iterations done.
+/// Hears the number of iterations done and the Gaussians then; false: enough.
+pub type Tick<'a> = dyn FnMut(u64, &Params) -> Result<bool> + 'a;
+
+/// Optimises `params` in place and gives the loss of every iteration.
 pub fn fit(
     params: &mut Params,
     targets: &[Target],
     settings: RasterSettings,
     iterations: u64,
     seed: u64,
-    tick: &mut dyn FnMut(u64),
+    tick: &mut Tick,
 ) -> Result<Vec<f64>> {
     ensure!(!targets.is_empty(), "no pictures to fit Gaussians to");
     let mut raster = CpuRasterizer::new(settings)?;
@@ -77,7 +80,9 @@ pub fn fit(
         raster.backward_into(&splats, &views, &pictures, &[upstream], &mut gradients)?;
         optimizer.step(params, &mut gradients, &scales, &opacities, iteration as f32 / iterations as f32);
         losses.push(loss);
-        tick(iteration + 1);
+        if !tick(iteration + 1, params)? {
+            break;
+        }
     }
     Ok(losses)
 }
@@ -169,20 +174,23 @@ mod tests {
         assert_eq!(start.len(), 2 * W * H);
         let run = || {
             let mut p = start.clone();
-            let losses = fit(&mut p, &targets(&seen), RasterSettings::default(), 300, 9, &mut |_| {}).unwrap();
+            let losses = fit(&mut p, &targets(&seen), RasterSettings::default(), 300, 9, &mut |_, _| Ok(true)).unwrap();
             (p, losses)
         };
         let (a, losses) = run();
         let (first, last) = (mean(&losses[..20]), mean(&losses[280..]));
         assert!(last < 0.35 * first, "{first} to {last}");
         assert_eq!(run(), (a, losses));
+        let mut p = start.clone();
+        let stopped = fit(&mut p, &targets(&seen), RasterSettings::default(), 300, 9, &mut |n, _| Ok(n < 5)).unwrap();
+        assert_eq!(stopped.len(), 5);
     }
 
     #[test]
     fn the_answer_is_kept_and_sky_and_exposure_pass_their_gradients() {
         let (truth, seen) = wall();
         let mut p = truth.clone();
-        let losses = fit(&mut p, &targets(&seen), RasterSettings::default(), 4, 1, &mut |_| {}).unwrap();
+        let losses = fit(&mut p, &targets(&seen), RasterSettings::default(), 4, 1, &mut |_, _| Ok(true)).unwrap();
         assert!(losses[0] < 1e-6, "{}", losses[0]);
         // Central differences through sky and exposure.
         let mut target = targets(&seen).remove(0);
@@ -209,6 +217,6 @@ mod tests {
             let slope = (at(step) - at(-step)) / f64::from(2.0 * step);
             assert!((slope - f64::from(g.alpha[i])).abs() < 2e-5, "{slope} {}", g.alpha[i]);
         }
-        assert!(fit(&mut p, &[], RasterSettings::default(), 1, 1, &mut |_| {}).is_err());
+        assert!(fit(&mut p, &[], RasterSettings::default(), 1, 1, &mut |_, _| Ok(true)).is_err());
     }
 }

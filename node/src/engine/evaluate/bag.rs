@@ -130,7 +130,11 @@ fn span(window: &Window<Frame>) -> Option<Span> {
 }
 
 /// The bag through decode, sync and poses; `each` returns false to stop early.
-fn run_front(source: &BagSource, config: &Config, mut each: impl FnMut(FrontOutput) -> Result<bool>) -> Result<()> {
+pub(crate) fn run_front(
+    source: &BagSource,
+    config: &Config,
+    mut each: impl FnMut(FrontOutput) -> Result<bool>,
+) -> Result<()> {
     let rig = source.rig();
     let store = PoseStore::of_bag(source, &rig, config);
     let mut front = Front::new(config, &rig, store);

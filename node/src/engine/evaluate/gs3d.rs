@@ -44,7 +44,10 @@ fn optimised(
         targets.push(Target { view, picture: Reference::new(&rgb01, w, h), sky, exposure });
     }
     let settings = start.raster_settings();
-    fit(&mut params, &targets, settings, iterations, clip.seed, &mut |done| tick(done, iterations))?;
+    fit(&mut params, &targets, settings, iterations, clip.seed, &mut |done, _| {
+        tick(done, iterations);
+        Ok(true)
+    })?;
     let gaussians = params.gaussians();
     let finite = gaussians.means.iter().flatten().chain(gaussians.scales.iter().flatten()).all(|x| x.is_finite());
     if !finite {

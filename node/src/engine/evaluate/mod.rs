@@ -5,7 +5,7 @@
 //! [`Figures`].
 
 pub mod bag;
-mod clip;
+pub(crate) mod clip;
 mod gs3d;
 mod method;
 mod nsfp;

@@ -238,6 +238,8 @@ impl Sink {
             tracks: finished.track_counts.finished,
             track_counts: finished.track_counts,
             objects: finished.object_counts,
+            overlap: finished.overlap,
+            batch: finished.batch,
             origin_m: origin.to_array(),
             epochs: self.epochs,
             held_out,
