@@ -9,7 +9,8 @@ use crate::bag::Bag;
 use crate::cdr::decode as cdr;
 use crate::msg::PointCloud2;
 use crate::output::ply::{PlyCloud, read_ply};
-use crate::pipeline::sink::{ANCHOR_FRAME, PREFIX};
+use crate::pipeline::messages::ANCHOR_FRAME;
+use crate::pipeline::sink::PREFIX;
 use crate::rigid::Rigid;
 
 /// ROS data type codes of the columns read.

@@ -39,6 +39,26 @@ pub struct Step {
     pub total_ms: f64,
 }
 
+/// What somebody wants of a step; nothing else is worked out. The map and the Gaussians always are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Demand {
+    /// Motion groups in the pictures (the motion masks).
+    pub motion: bool,
+    /// Point trajectories.
+    pub tracks: bool,
+    /// Moving objects.
+    pub objects: bool,
+    /// The static map, and with it the pictures (the map is judged by them).
+    pub map: bool,
+    /// The pictures, although there is no map.
+    pub pictures: bool,
+}
+
+impl Demand {
+    /// Everything.
+    pub const ALL: Self = Self { motion: true, tracks: true, objects: true, map: true, pictures: true };
+}
+
 /// Runs steps; owns the network, the map and the trackers.
 pub struct StepMaker {
     engine: Engine,
@@ -83,8 +103,53 @@ impl StepMaker {
         })
     }
 
-    /// Runs one window. `None` when the network's result was not finite: the window is dropped, counted and said.
+    /// Goes on with other cameras, in the order of the windows' frames.
+    pub fn set_cameras(&mut self, cameras: Vec<Intrinsics>) {
+        self.cameras = cameras;
+    }
+
+    /// Takes another map, in the place of the present one, which goes.
+    pub fn set_map(&mut self, map: StaticMap) {
+        self.map = map;
+    }
+
+    /// The map.
+    pub fn map(&self) -> &StaticMap {
+        &self.map
+    }
+
+    /// Trajectories alive.
+    pub fn tracks(&self) -> &[Track] {
+        self.tracker.live()
+    }
+
+    /// Objects alive that were seen often enough to be believed.
+    pub fn objects(&self) -> impl Iterator<Item = &MovingObject> {
+        self.objects.live().iter().filter(|o| o.confirmed(&self.config.objects))
+    }
+
+    /// Stage times so far.
+    pub fn timings(&self) -> &Timings {
+        &self.timings
+    }
+
+    /// Windows whose result was not finite and was thrown away.
+    pub fn non_finite(&self) -> u64 {
+        self.non_finite
+    }
+
+    /// The network, for what it says of itself.
+    pub fn engine(&self) -> &Engine {
+        &self.engine
+    }
+
+    /// Runs one window with everything. `None` when the network's result was not finite: the window is dropped, counted and said.
     pub fn run(&mut self, window: Window<Frame>) -> Result<Option<Step>> {
+        self.run_for(window, Demand::ALL)
+    }
+
+    /// The same, with no more than `demand` asks for.
+    pub fn run_for(&mut self, window: Window<Frame>, demand: Demand) -> Result<Option<Step>> {
         let start = Instant::now();
         let scene = match self.timings.time("network", || self.engine.step(&window, &self.cameras)) {
             Ok(scene) => scene,
@@ -98,36 +163,51 @@ impl StepMaker {
             },
         };
         let newest = window.steps.len() - 1;
-        let views = {
+        let views = if demand.pictures || demand.map {
             let targets = views_of(&window.steps[newest], &window.map_from_anchor, &self.cameras);
             let time_sec = newest_time_sec(&window);
-            let want = Want { flow: true, motion: true };
+            let want = Want { flow: true, motion: demand.motion };
             self.timings.time("render", || self.engine.render(&scene, &targets, time_sec, want))?
+        } else {
+            Vec::new()
         };
-        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
-        let look = SceneLook {
-            stamp_ns: window.stamp_ns,
-            map_from_anchor: &window.map_from_anchor,
-            scene: &scene,
-            cameras: &self.cameras,
-            poses: &poses,
-            rendered: &views,
-            first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
-        };
-        self.timings.time("map", || self.map.fuse_scene(&look));
-        let mut points = select::moving_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
-        for p in &mut points {
-            let known = self.map.evidence(p.position_map);
-            p.may_start = known.is_none_or(|k| f64::from(k.seen_for_sec) < STANDS_SEC);
+        if demand.map {
+            self.fuse(&window, &scene, &views);
+        } else {
+            // What is published relative to the map's origin needs one all the same.
+            self.map.set_origin(window.map_from_anchor.translation);
         }
-        self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
-        let (_, parts) = select::object_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
-        self.timings.time("objects", || self.objects.step(window.stamp_ns, window.epoch, &parts));
+        if demand.tracks {
+            let mut points = select::moving_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
+            for p in &mut points {
+                let known = self.map.evidence(p.position_map);
+                p.may_start = known.is_none_or(|k| f64::from(k.seen_for_sec) < STANDS_SEC);
+            }
+            self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
+        }
+        if demand.objects {
+            let (_, parts) = select::object_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
+            self.timings.time("objects", || self.objects.step(window.stamp_ns, window.epoch, &parts));
+        }
         let total_ms = start.elapsed().as_secs_f64() * 1e3;
         self.timings.add("step", total_ms);
         let index = self.steps;
         self.steps += 1;
         Ok(Some(Step { index, window, scene: Arc::new(scene), views, total_ms }))
+    }
+
+    fn fuse(&mut self, window: &Window<Frame>, scene: &Scene, views: &[RenderedView]) {
+        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
+        let look = SceneLook {
+            stamp_ns: window.stamp_ns,
+            map_from_anchor: &window.map_from_anchor,
+            scene,
+            cameras: &self.cameras,
+            poses: &poses,
+            rendered: views,
+            first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
+        };
+        self.timings.time("map", || self.map.fuse_scene(&look));
     }
 
     /// Moving objects that have ended since the last call.

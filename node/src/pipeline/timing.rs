@@ -14,6 +14,9 @@ pub struct StageStats {
     pub p99: f64,
 }
 
+/// Times kept per stage; beyond it the older half goes, so that a node may run for weeks.
+const MAX_TIMES: usize = 1 << 16;
+
 /// Milliseconds per stage, one entry per run of the stage.
 #[derive(Debug, Clone, Default)]
 pub struct Timings {
@@ -31,7 +34,16 @@ impl Timings {
 
     /// Books `ms` under `stage`.
     pub fn add(&mut self, stage: &'static str, ms: f64) {
-        self.stages.entry(stage).or_default().push(ms as f32);
+        let times = self.stages.entry(stage).or_default();
+        if times.len() >= MAX_TIMES {
+            times.drain(..MAX_TIMES / 2);
+        }
+        times.push(ms as f32);
+    }
+
+    /// The newest time of every stage, milliseconds.
+    pub fn last(&self) -> impl Iterator<Item = (&'static str, f64)> + '_ {
+        self.stages.iter().filter_map(|(stage, ms)| Some((*stage, f64::from(*ms.last()?))))
     }
 
     /// Takes over all of `other`'s entries.

@@ -25,7 +25,7 @@ use crate::rigid::Rigid;
 use crate::source::{Frame, Rig};
 use crate::window::PosedSet;
 
-use super::topics::{motion_mask, surface_depth};
+use crate::pipeline::messages::{motion_mask, surface_depth};
 
 /// Speed at which the flow pictures are fully saturated, m/s.
 const FULL_SPEED_MPS: f32 = 15.0;

@@ -3,7 +3,7 @@
 mod gallery;
 mod topics;
 
-pub use topics::{ANCHOR_FRAME, ORIGIN_FRAME, PREFIX, Published, Publisher, motion_mask, surface_depth};
+pub use topics::{PREFIX, Publisher};
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,6 +26,7 @@ use crate::tracks::Track;
 use crate::window::PosedSet;
 
 use super::front::TruthImage;
+use super::messages::Published;
 use super::metrics::{Counts, Metrics};
 use super::step::{Finished, Step};
 use super::timing::{Timings, peak_rss_mb};

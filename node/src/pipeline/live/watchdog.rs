@@ -1,0 +1,114 @@
+//! Says when an input stops and when it is back. Driven by the caller's clock, so it works under simulated time.
+
+/// Messages after a silence until an input counts as back: one that arrives now and then is not.
+const BACK_AFTER: u32 = 3;
+
+/// What happened to an input.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Change {
+    /// Nothing for so long, seconds.
+    Silent {
+        /// Which input.
+        input: usize,
+        /// How long, seconds.
+        for_sec: f64,
+    },
+    /// It sends again.
+    Back {
+        /// Which input.
+        input: usize,
+    },
+}
+
+#[derive(Debug, Clone, Default)]
+struct Input {
+    last_ns: Option<i64>,
+    silent: bool,
+    since_silent: u32,
+}
+
+/// Watches several inputs.
+#[derive(Debug)]
+pub struct Watchdog {
+    silence_sec: f64,
+    inputs: Vec<Input>,
+}
+
+impl Watchdog {
+    /// For so many inputs; one is silent after `silence_sec` without a message.
+    pub fn new(inputs: usize, silence_sec: f64) -> Self {
+        Self { silence_sec, inputs: vec![Input::default(); inputs] }
+    }
+
+    /// Another limit from now on, seconds.
+    pub fn set_silence(&mut self, silence_sec: f64) {
+        self.silence_sec = silence_sec;
+    }
+
+    /// A message of `input` came in at `now_ns`.
+    pub fn heard(&mut self, input: usize, now_ns: i64) {
+        if let Some(i) = self.inputs.get_mut(input) {
+            i.last_ns = Some(now_ns);
+            i.since_silent = i.since_silent.saturating_add(1);
+        }
+    }
+
+    /// What has changed by `now_ns`. The first call starts the watch of inputs that never sent.
+    pub fn poll(&mut self, now_ns: i64) -> Vec<Change> {
+        let mut changes = Vec::new();
+        for (input, i) in self.inputs.iter_mut().enumerate() {
+            // A clock that went back starts the wait anew.
+            let last_ns = i.last_ns.map_or(now_ns, |l| l.min(now_ns));
+            i.last_ns = Some(last_ns);
+            let for_sec = (now_ns - last_ns) as f64 * 1e-9;
+            if !i.silent && for_sec > self.silence_sec {
+                (i.silent, i.since_silent) = (true, 0);
+                changes.push(Change::Silent { input, for_sec });
+            } else if i.silent && i.since_silent >= BACK_AFTER && for_sec <= self.silence_sec {
+                i.silent = false;
+                changes.push(Change::Back { input });
+            }
+        }
+        changes
+    }
+
+    /// Inputs that are silent at present.
+    pub fn silent(&self) -> Vec<usize> {
+        (0..self.inputs.len()).filter(|&i| self.inputs[i].silent).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SEC: i64 = 1_000_000_000;
+
+    #[test]
+    fn silence_is_said_once_and_its_end_once() {
+        let mut w = Watchdog::new(2, 1.0);
+        assert_eq!(w.poll(0), []);
+        w.heard(0, SEC);
+        assert_eq!(w.poll(SEC * 3 / 2), [Change::Silent { input: 1, for_sec: 1.5 }]);
+        assert_eq!(w.silent(), [1]);
+        for k in 0..2 {
+            w.heard(1, 2 * SEC + k);
+        }
+        w.heard(0, 2 * SEC);
+        assert_eq!(w.poll(2 * SEC), [], "two messages are not a stream");
+        w.heard(1, 2 * SEC + 5);
+        assert_eq!(w.poll(2 * SEC + 9), [Change::Back { input: 1 }]);
+        assert_eq!(w.poll(2 * SEC + 10), []);
+        assert_eq!(w.poll(4 * SEC).len(), 2, "both stop");
+    }
+
+    #[test]
+    fn a_clock_that_goes_back_or_stands_is_no_silence() {
+        let mut w = Watchdog::new(1, 1.0);
+        w.heard(0, 100 * SEC);
+        assert_eq!(w.poll(100 * SEC), []);
+        assert_eq!(w.poll(10 * SEC), []);
+        assert_eq!(w.poll(10 * SEC), []);
+        assert_eq!(w.poll(12 * SEC).len(), 1);
+    }
+}
