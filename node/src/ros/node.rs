@@ -301,6 +301,7 @@ impl Running {
         let mut dog = Watchdog::new(cameras + 1, self.config.live.silence_sec);
         let mut watched = Instant::now();
         let mut info_changed = false;
+        let (mut in_use, mut wanted): (Vec<usize>, _) = ((0..cameras).collect(), None);
         while !stop.load(Ordering::Relaxed) {
             let (sent, other) = self.take(&messages, &mut describer);
             let now = now_ns(&self.clock);
@@ -318,11 +319,17 @@ impl Running {
             }
             if watched.elapsed() >= WATCH {
                 watched = Instant::now();
-                if self.watch(&mut dog, now) && self.config.live.degrade {
-                    let silent = dog.silent();
-                    let left: Vec<usize> = (0..cameras).filter(|c| !silent.contains(c)).collect();
-                    live.command(Command::Cameras(left));
+                self.watch(&mut dog, now);
+                let lively = dog.lively(cameras, now).filter(|_| self.config.live.degrade);
+                // Twice in a row: cameras that stop or come back together do so within a moment, not at once.
+                if let Some(left) = &lively
+                    && lively == wanted
+                    && *left != in_use
+                {
+                    in_use.clone_from(left);
+                    live.command(Command::Cameras(left.clone()));
                 }
+                wanted = lively;
             }
             if self.reported.elapsed() >= REPORT {
                 let status = live.status();
@@ -348,9 +355,8 @@ impl Running {
         Ok(status.failed_steps == 0 && status.non_finite_windows == 0)
     }
 
-    /// Says what stopped and what came back; true when a camera is among it.
-    fn watch(&mut self, dog: &mut Watchdog, now_ns: i64) -> bool {
-        let mut camera = false;
+    /// Says what stopped and what came back.
+    fn watch(&mut self, dog: &mut Watchdog, now_ns: i64) {
         for change in dog.poll(now_ns) {
             let (input, silent) = match change {
                 Change::Silent { input, for_sec } => {
@@ -363,12 +369,10 @@ impl Running {
                     (input, false)
                 }
             };
-            camera |= matches!(self.streams.get(input).map(|s| s.purpose), Some(Use::Image(_)));
             if let Some(report) = self.reports.get_mut(input) {
                 report.silent = silent;
             }
         }
-        camera
     }
 
     /// Sends `/diagnostics` when it is time, and looks for publishers whose QoS does not match.

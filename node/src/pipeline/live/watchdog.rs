@@ -3,6 +3,9 @@
 /// Messages after a silence until an input counts as back: one that arrives now and then is not.
 const BACK_AFTER: u32 = 3;
 
+/// An input that sent within this share of the silence limit still sends.
+const LIVELY_SHARE: f64 = 0.5;
+
 /// What happened to an input.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Change {
@@ -72,9 +75,16 @@ impl Watchdog {
         changes
     }
 
-    /// Inputs that are silent at present.
-    pub fn silent(&self) -> Vec<usize> {
-        (0..self.inputs.len()).filter(|&i| self.inputs[i].silent).collect()
+    /// Which of the first `cameras` inputs to go on with: those that are not silent, as long as one of them still sends.
+    /// None when nothing does (all have been stopped, or are just about to be silent too): nothing is gained by a change.
+    pub fn lively(&self, cameras: usize, now_ns: i64) -> Option<Vec<usize>> {
+        let silent = |i: &usize| self.inputs.get(*i).is_none_or(|input| input.silent);
+        let left: Vec<usize> = (0..cameras).filter(|i| !silent(i)).collect();
+        let sends = |i: &usize| {
+            let last_ns = self.inputs.get(*i).and_then(|input| input.last_ns);
+            last_ns.is_some_and(|l| (now_ns.saturating_sub(l) as f64) * 1e-9 < LIVELY_SHARE * self.silence_sec)
+        };
+        left.iter().any(sends).then_some(left)
     }
 }
 
@@ -90,7 +100,8 @@ mod tests {
         assert_eq!(w.poll(0), []);
         w.heard(0, SEC);
         assert_eq!(w.poll(SEC * 3 / 2), [Change::Silent { input: 1, for_sec: 1.5 }]);
-        assert_eq!(w.silent(), [1]);
+        assert_eq!(w.lively(2, SEC * 3 / 2), None, "input 0 has not sent for half the limit");
+        assert_eq!(w.lively(2, SEC * 5 / 4), Some(vec![0]));
         for k in 0..2 {
             w.heard(1, 2 * SEC + k);
         }
