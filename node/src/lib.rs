@@ -18,7 +18,6 @@ pub mod output;
 pub mod pipeline;
 pub mod poses;
 pub mod rigid;
-#[cfg(feature = "ros")]
 pub mod ros;
 pub mod saved;
 pub mod soak;

@@ -238,7 +238,7 @@ def pose_dropout(program, bag, work):
             running(peer, node, drive)
             second = 4_000_000_000
             play(peer, drive)
-            until(lambda: peer.count("/storm/output/gaussians") > 3, 20, "steps")
+            until(lambda: peer.count("/storm/output/gaussians") > 1, 20, "steps")
             seen = {}
 
             def note(t):
@@ -290,7 +290,7 @@ def clock_jump(program, bag, work):
         with StormNode(program, RELIABLE_INPUT) as node:
             running(peer, node, drive)
             play(peer, drive)
-            until(lambda: peer.count("/storm/output/gaussians") > 3, 20, "steps")
+            until(lambda: peer.count("/storm/output/gaussians") > 1, 20, "steps")
             time.sleep(1.0)
             first = len(stamps(peer))
             play(peer, drive)
@@ -302,26 +302,33 @@ def clock_jump(program, bag, work):
 
 
 def burst(program, bag, work):
-    """100 images at once: the newest is used, the others are counted, memory stays as it was."""
+    """120 images at once: nothing is worked off that newer images make worthless, all of it is counted, and the node goes on
+    with what comes next."""
     drive = Drive(bag)
     with Peer() as peer:
         peer.offer(drive.messages)
-        with StormNode(program, RELIABLE_INPUT | {"live.queue": 10}) as node:
+        with StormNode(program, RELIABLE_INPUT | {"live.queue": 20}) as node:
             running(peer, node, drive)
             play(peer, drive)
-            until(lambda: peer.count("/storm/output/gaussians") > 3, 20, "steps")
-            before = len(stamps(peer))
+            until(lambda: peer.count("/storm/output/gaussians") > 1, 20, "steps")
+            before, turn = len(stamps(peer)), 4_000_000_000
             # As fast as DDS takes them: 120 images, and the poses.
-            play(peer, drive, by_ns=4_000_000_000, speed=1000.0)
-            last = drive.stamps()[-1] + 4_000_000_000
-            until(lambda: last - stamps(peer)[-1] <= 200_000_000, 30, "a step near the burst's end")
+            play(peer, drive, by_ns=turn, speed=1000.0)
+            time.sleep(2.5)
+            during = len(stamps(peer)) - before
+            expect(during < 30, "the burst was worked off instead of skipped")
+            play(peer, drive, by_ns=2 * turn)
+            last = drive.stamps()[-1] + 2 * turn
+            until(lambda: last - stamps(peer)[-1] <= 500_000_000, 30, "a step near the end")
             time.sleep(1.5)
-            values = newest(peer)["losses"][2]
+            now = newest(peer)
+            values = now["losses"][2]
             lost = sum(int(v) for k, v in values.items() if k.startswith("images dropped"))
-            print(f"  {len(stamps(peer)) - before} steps after the burst, {lost} images dropped, "
-                  f"{values['sets skipped, superseded']} sets superseded")
-            expect(int(values["sets skipped, superseded"]) + lost > 10, f"{values}")
-            expect(len(stamps(peer)) - before < 30, "the burst was worked off instead of skipped")
+            skipped = sum(int(v) for k, v in values.items() if k.startswith("sets skipped"))
+            print(f"  {during} steps in the burst, {lost} images dropped, {skipped} sets skipped")
+            used = CAMERAS * int(values["sets"])
+            expect(0 <= int(values["images in"]) - lost - used <= 3 * CAMERAS, f"images unaccounted for: {values}")
+            expect(now["pipeline"][2]["clock jumps and resets"] == "0", "a burst is no clock jump")
             expect(node.interrupt() == 0, node.log())
 
 
@@ -357,7 +364,7 @@ def services_and_parameters(program, bag, work):
             refused = peer.call(Trigger, "/storm/save_map", Trigger.Request())
             expect(not refused.success and "not running yet" in refused.message, refused)
             play(peer, drive)
-            until(lambda: peer.count("/storm/output/gaussians") > 3, 20, "steps")
+            until(lambda: peer.count("/storm/output/gaussians") > 1, 20, "steps")
             saved = peer.call(Trigger, "/storm/save_map", Trigger.Request())
             expect(saved.success and "Gaussians" in saved.message, saved)
             parameters(peer)
@@ -439,7 +446,7 @@ def sim_time(program, bag, work):
         with StormNode(program, RELIABLE_INPUT | {"use_sim_time": "true", "live.silence_sec": 0.5}) as node:
             running(peer, node, drive)
             play(peer, drive, each=tick)
-            until(lambda: peer.count("/storm/output/gaussians") > 3, 20, "steps")
+            until(lambda: peer.count("/storm/output/gaussians") > 1, 20, "steps")
             # The bag is paused: time stands still.
             time.sleep(2.0)
             expect("has sent nothing" not in node.log(), node.log())

@@ -213,7 +213,7 @@ section! {
         /// What pictures and poses are asked for with: `sensor_data` (best effort, matches every publisher) or `reliable`.
         reliability: String = "sensor_data".into(),
         /// Pictures of one camera that may wait to be decoded, and again to be used; the oldest goes first.
-        queue: usize = 10,
+        queue: usize = 20,
         /// A camera or the pose that sends nothing for longer than this has stopped, seconds.
         silence_sec: f64 = 1.0,
         /// Whether the node goes on with the cameras that are left when one stops.

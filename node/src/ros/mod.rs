@@ -3,18 +3,30 @@
 //! One thread spins ROS and never waits for a step. r2r hands messages over in channels of ten and loses the newest when
 //! one is full, so every stream is emptied after every spin, into rings of our own that lose the oldest and count it.
 
-mod convert;
-mod describe;
-mod diagnostics;
-mod map_output;
-mod names;
-mod node;
-mod outputs;
-mod parameters;
-mod publisher;
-mod qos;
-mod services;
-mod streams;
-mod topics;
+//! What needs no ROS to be compiled is always there, and tested everywhere; the rest is behind the feature `ros`.
 
+pub mod convert;
+pub mod describe;
+pub mod diagnostics;
+pub mod names;
+pub mod topics;
+
+#[cfg(feature = "ros")]
+mod map_output;
+#[cfg(feature = "ros")]
+mod node;
+#[cfg(feature = "ros")]
+mod outputs;
+#[cfg(feature = "ros")]
+mod parameters;
+#[cfg(feature = "ros")]
+mod publisher;
+#[cfg(feature = "ros")]
+mod qos;
+#[cfg(feature = "ros")]
+mod services;
+#[cfg(feature = "ros")]
+mod streams;
+
+#[cfg(feature = "ros")]
 pub use node::run;

@@ -10,6 +10,7 @@
 //! ROS; stages are those of a replay.
 
 mod inbox;
+mod skew;
 mod status;
 #[cfg(test)]
 mod tests;

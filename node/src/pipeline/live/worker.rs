@@ -11,6 +11,7 @@ use crossbeam::channel::{Receiver, Sender, unbounded};
 use tracing::{info, warn};
 
 use super::inbox::{Inbox, Taken};
+use super::skew::SkewGate;
 use super::status::Status;
 use crate::config::{Config, MapConfig};
 use crate::engine::Engine;
@@ -155,6 +156,7 @@ impl Live {
         };
         let stepper = Stepper {
             front: Front::on_demand(&config, &rig, store),
+            skew: SkewGate::new(rig.cameras.len(), &config.sync),
             saver: Saver::new(config.map.save_every_sec),
             maker,
             config,
@@ -334,6 +336,7 @@ struct Stepper {
     outlet: Box<dyn Outlet>,
     clock: Box<dyn Fn() -> i64 + Send>,
     publish: Timings,
+    skew: SkewGate,
     own: Own,
 }
 
@@ -370,6 +373,13 @@ impl Stepper {
             self.own.paused_images += 1;
             return;
         }
+        let event = match event {
+            Event::Image { camera, stamp_ns, .. } if !self.skew.admits(camera, stamp_ns) => {
+                let detail = format!("camera {camera} at {stamp_ns} ns: far behind the other cameras");
+                Event::Lost { camera: Some(camera), reason: DropReason::Late, detail }
+            }
+            event => event,
+        };
         self.front.take(event, ready);
         for output in ready.drain(..) {
             if let FrontOutput::Set(set) = output {
