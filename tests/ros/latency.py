@@ -91,7 +91,7 @@ def measure(program: str, bag: Path, topics: dict, seconds: float, rate: float) 
             for topic, kind in topics.items():
                 peer.listen(topic, kind, LATCHED if topic.endswith("/map") else RELIABLE, keep=False)
             peer.listen("/diagnostics", DIAGNOSTICS)
-            for stage in ("publish", "network", "step"):
+            for stage in ("publish", "network", "step", "latency"):
                 peer.listen(f"/storm/debug/{stage}_ms", NUMBER, BEST_EFFORT)
             with StormNode(program, {"live.cameras": 3, "live.transport": "compressed"}) as node:
                 until(lambda: peer.count("/storm/output/flow") > 3, 90, f"output:\n{node.log()}")
@@ -115,8 +115,10 @@ def measure(program: str, bag: Path, topics: dict, seconds: float, rate: float) 
                 late = [(at - int.from_bytes(d[4:8], "little") * 10**9 - int.from_bytes(d[8:12], "little")) * 1e-6
                         for at, d in flow]
                 result["steps"] = len(late)
-                result["latency_ms"] = quantiles(late)
-                for stage in ("publish", "network", "step"):
+                # To the arrival in Python, which takes its own time; `latency_ms` is the node's own word.
+                result["arrival_ms"] = quantiles(late)
+                result["processor_ms_per_step"] = round(1e3 * cpu / max(len(late), 1), 1)
+                for stage in ("publish", "network", "step", "latency"):
                     values = [m.data for m in peer.messages(f"/storm/debug/{stage}_ms", NUMBER)]
                     result[f"{stage}_ms"] = quantiles(values)
                 result["listened"] = {t: peer.count(t) for t in topics}
@@ -159,9 +161,10 @@ def main():
         for name, topics in [("all topics", every), ("flow alone", {"/storm/output/flow": CLOUD})]:
             results[name] = measure(program, bag, topics, args.seconds, args.rate)
             print(name, json.dumps(results[name], indent=1), flush=True)
-    spared = 1 - results["flow alone"]["processor_share"] / results["all topics"]["processor_share"]
+    # Per step: on a machine that cannot keep up both take all there is, and differ in steps.
+    spared = 1 - results["flow alone"]["processor_ms_per_step"] / results["all topics"]["processor_ms_per_step"]
     results["processor_time_spared_by_flow_alone"] = round(spared, 3)
-    print(f"flow alone takes {100 * spared:.0f} % less processor time than all topics; load average {results['load_average']:.1f}")
+    print(f"flow alone takes {100 * spared:.0f} % less processor time a step than all topics; load average {results['load_average']:.1f}")
     if args.json:
         args.json.write_text(json.dumps(results, indent=1) + "\n")
     # Some middleware threads outlive rclpy's shutdown.

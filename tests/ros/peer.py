@@ -133,13 +133,23 @@ class Peer:
         self.lock = threading.Lock()
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.ending = False
+        self.thread = threading.Thread(target=self.spin, daemon=True)
         self.thread.start()
+
+    def spin(self):
+        try:
+            self.executor.spin()
+        except Exception:
+            # rclpy's executor may stumble over its own shutdown; anything before that is an error.
+            if not self.ending:
+                raise
 
     def __enter__(self):
         return self
 
     def __exit__(self, kind, *_):
+        self.ending = True
         if kind and self.count("/diagnostics"):
             for part in diagnosis(self.last("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")).items():
                 print("--- diagnostics:", *part, flush=True)

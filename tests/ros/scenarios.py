@@ -365,6 +365,10 @@ def services_and_parameters(program, bag, work):
             expect(not refused.success and "not running yet" in refused.message, refused)
             play(peer, drive)
             until(lambda: peer.count("/storm/output/gaussians") > 1, 20, "steps")
+            # Who joins late gets the whole map, although nothing comes in any more.
+            time.sleep(0.5)
+            peer.listen("/storm/output/map", CLOUD, LATCHED)
+            until(lambda: peer.count("/storm/output/map") > 0, 10, "map for a late listener")
             saved = peer.call(Trigger, "/storm/save_map", Trigger.Request())
             expect(saved.success and "Gaussians" in saved.message, saved)
             parameters(peer)

@@ -33,6 +33,8 @@ pub struct MapOutput {
     /// Changes up to this revision are sent or in `pending`.
     seen: u64,
     pending: BTreeSet<TileIndex>,
+    /// Tiles sent on `map_update`.
+    known: BTreeSet<TileIndex>,
 }
 
 impl MapOutput {
@@ -51,13 +53,14 @@ impl MapOutput {
             update_listeners: 0,
             seen: 0,
             pending: BTreeSet::new(),
+            known: BTreeSet::new(),
         })
     }
 
-    /// Another map took the place of the one so far: all of it is news.
+    /// Another map took the place of the one so far: all of it is news, and what was sent of the old one is gone.
     pub fn forget(&mut self) {
-        (self.seen, self.whole_sent, self.update_listeners) = (0, None, 0);
-        self.pending.clear();
+        (self.seen, self.whole_sent) = (0, None);
+        self.pending.append(&mut self.known);
     }
 
     /// Sends what is due.
@@ -67,6 +70,9 @@ impl MapOutput {
     pub fn offer(&mut self, map: &StaticMap, stamp_ns: i64, config: &LiveConfig, counts: &mut Published) -> Result<()> {
         if self.last.is_some_and(|last| last.elapsed().as_secs_f64() < config.map_every_sec) || map.revision() == 0 {
             return Ok(());
+        }
+        if map.revision() < self.seen {
+            self.forget();
         }
         let (whole, update) = (self.whole.listeners(), self.update.listeners());
         let joined = whole > self.whole_listeners || (update > self.update_listeners && whole > 0);
@@ -87,7 +93,7 @@ impl MapOutput {
         if update > 0 {
             self.send_changes(map, stamp_ns, (max_bytes / UPDATE_BYTES as f64) as usize, counts)?;
         } else {
-            self.pending.clear();
+            (self.pending.clear(), self.known.clear());
         }
         Ok(())
     }
@@ -123,6 +129,7 @@ impl MapOutput {
         if tiles.is_empty() {
             return Ok(());
         }
+        self.known.extend(tiles.iter().filter(|(_, cloud)| !cloud.is_empty()).map(|(tile, _)| *tile));
         let tile_m = map.config().tile_m;
         let header = Header { stamp_ns, frame_id: ORIGIN_FRAME.into() };
         let built = tile_cloud(header, &tiles, |tile| tile.map(|i| (f64::from(i) * tile_m) as f32))?;

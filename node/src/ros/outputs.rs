@@ -76,6 +76,8 @@ pub struct Outputs {
     poses: VecDeque<(i64, Rigid)>,
     path_sent: Option<Instant>,
     origin: Option<DVec3>,
+    /// Of the newest step.
+    stamp_ns: Option<i64>,
     counts: Published,
 }
 
@@ -118,6 +120,7 @@ impl Outputs {
             poses: VecDeque::new(),
             path_sent: None,
             origin: None,
+            stamp_ns: None,
             counts: Published::default(),
         })
     }
@@ -232,10 +235,15 @@ impl Outlet for Outputs {
         }
         self.pictures(step, active)?;
         self.path()?;
-        if self.config.live.map {
-            self.map.offer(maker.map(), step.window.stamp_ns, &self.config.live, &mut self.counts)?;
+        self.stamp_ns = Some(step.window.stamp_ns);
+        self.idle(maker)
+    }
+
+    fn idle(&mut self, maker: &StepMaker) -> Result<()> {
+        match (self.config.live.map, self.stamp_ns) {
+            (true, Some(stamp_ns)) => self.map.offer(maker.map(), stamp_ns, &self.config.live, &mut self.counts),
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     fn configure(&mut self, config: &Config) {

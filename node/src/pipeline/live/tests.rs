@@ -85,6 +85,10 @@ impl Outlet for Slow {
         Ok(())
     }
 
+    fn idle(&mut self, _: &StepMaker) -> anyhow::Result<()> {
+        Ok(())
+    }
+
     fn configure(&mut self, _: &Config) {}
 
     fn times(&mut self, _: &[(&'static str, f64)]) {}

@@ -90,6 +90,11 @@ pub trait Outlet: Send {
     /// # Errors
     /// What could not be made or sent.
     fn step(&mut self, step: &Step, maker: &StepMaker, active: &[usize]) -> Result<()>;
+    /// Called often, whether or not there are steps: what goes on without them.
+    ///
+    /// # Errors
+    /// What could not be made or sent.
+    fn idle(&mut self, maker: &StepMaker) -> Result<()>;
     /// Another configuration.
     fn configure(&mut self, config: &Config);
     /// Times of all stages, after each step.
@@ -357,6 +362,9 @@ impl Stepper {
                 self.take(event, &mut ready);
             }
             let latency_ms = if self.own.paused { None } else { self.step_newest() };
+            if let Err(e) = self.outlet.idle(&self.maker) {
+                self.output_failed(&format!("{e:#}"));
+            }
             self.saver.offer(&mut self.maker);
             if !idle {
                 self.report(latency_ms);
@@ -417,15 +425,19 @@ impl Stepper {
         self.own.gaussians = step.scene.gaussians.len() as u64;
         let start = Instant::now();
         if let Err(e) = self.outlet.step(&step, &self.maker, self.front.active()) {
-            self.own.failed_outputs += 1;
-            if self.own.failed_outputs <= LOGGED {
-                warn!("step at {stamp_ns} ns could not be published whole: {e:#}");
-            }
+            self.output_failed(&format!("step at {stamp_ns} ns: {e:#}"));
         }
         self.publish.add("publish", start.elapsed().as_secs_f64() * 1e3);
         // What has ended is of no use to anybody here; it would only fill memory.
         (self.maker.ended_tracks(), self.maker.ended_objects());
         Some(((self.clock)() - newest_ns) as f64 * 1e-6)
+    }
+
+    fn output_failed(&mut self, why: &str) {
+        self.own.failed_outputs += 1;
+        if self.own.failed_outputs <= LOGGED {
+            warn!("not everything could be published: {why}");
+        }
     }
 
     fn obey(&mut self, command: Command) {
