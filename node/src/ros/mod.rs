@@ -18,11 +18,11 @@ mod node;
 #[cfg(feature = "ros")]
 mod outputs;
 #[cfg(feature = "ros")]
-mod parameters;
+pub mod parameters;
 #[cfg(feature = "ros")]
 mod publisher;
 #[cfg(feature = "ros")]
-mod qos;
+pub mod qos;
 #[cfg(feature = "ros")]
 mod services;
 #[cfg(feature = "ros")]

@@ -59,20 +59,3 @@ pub fn mismatch(asked: &QosProfile, offered: &QosProfile) -> Option<&'static str
     }
     None
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn mismatches_are_those_of_dds() {
-        let best = QosProfile::sensor_data();
-        let reliable = QosProfile::default().reliable();
-        assert_eq!(mismatch(&best, &best), None);
-        assert_eq!(mismatch(&best, &reliable), None);
-        assert_eq!(mismatch(&reliable, &reliable), None);
-        assert!(mismatch(&reliable, &best).is_some_and(|m| m.contains("live.reliability")));
-        assert!(mismatch(&statics(), &reliable.volatile()).is_some_and(|m| m.contains("transient_local")));
-        assert_eq!(mismatch(&statics(), &statics()), None);
-    }
-}

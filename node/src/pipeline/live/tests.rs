@@ -161,8 +161,7 @@ fn fed_slowly_every_set_gives_a_step_and_nothing_is_lost() {
     for i in 0..6 {
         run.push(1, pose(i));
         run.push(0, picture(i));
-        assert!(run.until(|s| s.steps + 1 == (i as u64).max(1)) || i == 0, "{:?}", run.live.status());
-        assert!(run.until(|s| s.steps >= i as u64));
+        assert!(run.until(|s| s.sets == i as u64 + 1 && s.steps == i as u64), "{:?}", run.live.status());
     }
     let seen = run.seen.clone();
     let status = run.live.stop().unwrap();
