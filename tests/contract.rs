@@ -60,3 +60,14 @@ fn wrong_usage_is_exit_code_1_and_names_what_is_wrong() {
     assert_eq!(code(&storm(&["--help"])), 0);
     assert_eq!(code(&storm(&["--version"])), 0);
 }
+
+/// Built without ROS 2 the program says how to come by it.
+#[cfg(not(feature = "ros"))]
+#[test]
+fn the_node_without_ros_explains_what_to_source() {
+    let output = storm(&["node", "--ros-args", "-p", "live.cameras:=3"]);
+    assert_eq!(code(&output), 1);
+    for words in ["setup.bash", ".ci/ros-prefix", "--features ros -- node --ros-args -p live.cameras:=3"] {
+        assert!(stderr(&output).contains(words), "{}", stderr(&output));
+    }
+}

@@ -22,6 +22,7 @@ pub mod pipeline;
 pub mod poses;
 pub mod refine;
 pub mod rigid;
+pub mod ros;
 pub mod saved;
 pub mod soak;
 pub mod source;

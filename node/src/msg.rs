@@ -159,3 +159,65 @@ pub struct Path {
     /// Poses along the path.
     pub poses: Vec<PoseStamped>,
 }
+
+/// `diagnostic_msgs/DiagnosticStatus`.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct DiagnosticStatus {
+    /// 0 fine, 1 warning, 2 error, 3 stale.
+    pub level: u8,
+    /// What it is of.
+    pub name: String,
+    /// One line.
+    pub message: String,
+    /// Device or program.
+    pub hardware_id: String,
+    /// Key and value.
+    pub values: Vec<(String, String)>,
+}
+
+/// `visualization_msgs/Marker`, as far as it is used: a box or an arrow.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Marker {
+    /// Stamp and frame.
+    pub header: Header,
+    /// Names are unique within a namespace.
+    pub namespace: String,
+    /// Name.
+    pub id: i32,
+    /// What is drawn.
+    pub shape: MarkerShape,
+    /// Standing of the shape in the frame.
+    pub pose: Rigid,
+    /// Size of a box, or diameters of an arrow's shaft and head (and 0: head length as it comes), metres.
+    pub scale: [f64; 3],
+    /// Red, green, blue, opacity, 0 to 1.
+    pub color: [f32; 4],
+    /// When it goes by itself, nanoseconds.
+    pub lifetime_ns: i64,
+}
+
+/// What a [`Marker`] draws.
+#[derive(Debug, Clone, PartialEq)]
+pub enum MarkerShape {
+    /// A box.
+    Cube,
+    /// An arrow between two points of the marker's frame, metres.
+    Arrow([[f64; 3]; 2]),
+}
+
+/// `vision_msgs/Detection3D`, one hypothesis each.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Detection {
+    /// Stamp and frame.
+    pub header: Header,
+    /// Name that stays the same over time.
+    pub id: String,
+    /// What it is.
+    pub class_id: String,
+    /// How sure that is, 0 to 1.
+    pub score: f64,
+    /// Centre of the box.
+    pub pose: Rigid,
+    /// Size of the box along its own axes, metres.
+    pub size: [f64; 3],
+}

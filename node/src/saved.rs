@@ -11,7 +11,8 @@ use crate::cdr::decode as cdr;
 use crate::msg::PointCloud2;
 use crate::output::objects_csv::{OBJECTS_FOLDER, read_objects};
 use crate::output::ply::{PlyCloud, read_ply};
-use crate::pipeline::sink::{ANCHOR_FRAME, PREFIX};
+use crate::pipeline::messages::ANCHOR_FRAME;
+use crate::pipeline::sink::PREFIX;
 use crate::rigid::Rigid;
 use crate::sync::clock::seconds_between;
 

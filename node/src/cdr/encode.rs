@@ -7,9 +7,9 @@ use crate::msg::{CameraInfo, CompressedImage, Header, Image, Path, PointCloud2, 
 use crate::rigid::Rigid;
 
 /// Elements of a 6x6 covariance.
-const COVARIANCE_LEN: usize = 36;
+pub(super) const COVARIANCE_LEN: usize = 36;
 
-fn header(w: &mut CdrWriter, h: &Header) {
+pub(super) fn header(w: &mut CdrWriter, h: &Header) {
     w.stamp(h.stamp_ns);
     w.string(&h.frame_id);
 }
@@ -19,7 +19,7 @@ fn quaternion(w: &mut CdrWriter, q: DQuat) {
 }
 
 /// Position (or translation) then rotation: `Pose` and `Transform` have the same layout.
-fn rigid(w: &mut CdrWriter, t: &Rigid) {
+pub(super) fn rigid(w: &mut CdrWriter, t: &Rigid) {
     w.f64_array(&t.translation.to_array());
     quaternion(w, t.rotation);
 }

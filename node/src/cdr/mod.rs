@@ -5,6 +5,7 @@
 
 pub mod decode;
 pub mod encode;
+pub mod encode_live;
 pub mod read;
 pub mod schema;
 pub mod write;

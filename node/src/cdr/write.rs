@@ -107,6 +107,11 @@ impl CdrWriter {
         self.bytes.extend_from_slice(&value.to_le_bytes());
     }
 
+    /// `float32`.
+    pub fn f32(&mut self, value: f32) {
+        self.u32(value.to_bits());
+    }
+
     /// `float64`.
     pub fn f64(&mut self, value: f64) {
         self.align(8);

@@ -180,8 +180,8 @@ pub(super) fn time_network(name: &str, section: &ModelConfigSection, runs: usize
     let peak_rss_mb = peak_rss_mb();
     let (scene, views) = last.context("no run")?;
     let gaussians = scene.gaussians.len();
-    let agreement = Agreement::default();
-    let step = Step { index: 0, window, scene: Arc::new(scene), views, agreement, total_ms: 0.0 };
+    let agreement = Arc::new(Agreement::default());
+    let step = Step { index: 0, window, scene: Arc::new(scene), views: views.into(), agreement, total_ms: 0.0 };
     let scores = score(engine.raster_settings(), step, &drive, &cameras)?;
     Ok(Setting {
         model: name.into(),

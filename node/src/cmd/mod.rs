@@ -7,6 +7,7 @@ mod eval;
 mod info;
 mod interrupt;
 mod map;
+mod node;
 mod refine;
 mod render;
 mod replay;
@@ -73,6 +74,8 @@ enum Command {
     Demo(demo::Args),
     /// Reconstruct a recorded bag (MCAP or sqlite3, file or folder) into a results folder.
     Replay(replay::Args),
+    /// Run live under ROS 2: topics in, topics out.
+    Node(node::Args),
     /// Write a procedural drive as a bag, ground truth included.
     Synth(synth::Args),
     /// Draw a saved map or step from any pose at any time.
@@ -105,6 +108,7 @@ impl Cli {
         let result = match self.command {
             Command::Demo(a) => demo::run(&a, progress),
             Command::Replay(a) => replay::run(&a, progress),
+            Command::Node(a) => node::run(&a),
             Command::Synth(a) => synth::run(&a, progress),
             Command::Render(a) => render::run(&a),
             Command::Map(a) => map::run(&a),

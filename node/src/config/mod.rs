@@ -5,10 +5,12 @@
 
 mod docs;
 mod file;
+mod parameters;
 mod section;
 mod validate;
 
 pub use file::ConfigError;
+pub use parameters::RUN_TIME;
 pub use section::ParameterDoc;
 use section::section;
 use serde::{Deserialize, Serialize};
@@ -241,6 +243,32 @@ section! {
     }
 }
 
+section! {
+    /// The live node.
+    pub struct LiveConfig {
+        /// Cameras that must be there before `storm node` starts; 0: those there are when the topics have been the same for 2 s.
+        cameras: usize = 0,
+        /// Which pictures to take where a camera offers both: `auto` (raw), `raw`, `compressed`.
+        transport: String = "auto".into(),
+        /// What pictures and poses are asked for with: `sensor_data` (best effort, matches every publisher) or `reliable`.
+        reliability: String = "sensor_data".into(),
+        /// Pictures of one camera that may wait to be decoded, and again to be used; the oldest goes first.
+        queue: usize = 20,
+        /// A camera or the pose that sends nothing for longer than this has stopped, seconds.
+        silence_sec: f64 = 1.0,
+        /// Whether the node goes on with the cameras that are left when one stops.
+        degrade: bool = true,
+        /// Whether the map is kept.
+        map: bool = true,
+        /// Folder the map is kept and saved in; empty: it lives in memory alone.
+        map_dir: String = String::new(),
+        /// Least time between two messages of the map, seconds.
+        map_every_sec: f64 = 1.0,
+        /// Most in one message of the map, MiB: the whole map is thinned out evenly, changed tiles wait for the next message.
+        map_max_mb: f64 = 8.0,
+    }
+}
+
 /// The whole configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -265,6 +293,8 @@ pub struct Config {
     pub objects: ObjectsConfig,
     /// What is written.
     pub output: OutputConfig,
+    /// The live node.
+    pub live: LiveConfig,
 }
 
 impl Config {
@@ -281,6 +311,7 @@ impl Config {
         docs.extend(TracksConfig::describe("tracks"));
         docs.extend(ObjectsConfig::describe("objects"));
         docs.extend(OutputConfig::describe("output"));
+        docs.extend(LiveConfig::describe("live"));
         docs
     }
 }

@@ -64,6 +64,13 @@ impl Config {
         count("objects.max_objects", self.objects.max_objects, 1, 1_000_000)?;
         between("output.min_opacity", self.output.min_opacity, 0.0, 1.0)?;
         count("output.report_steps", self.output.report_steps, 0, 1000)?;
+        count("live.cameras", self.live.cameras, 0, crate::source::topics::MAX_CAMERAS)?;
+        count("live.queue", self.live.queue, 1, 1000)?;
+        between("live.silence_sec", self.live.silence_sec, 0.05, 3600.0)?;
+        between("live.map_every_sec", self.live.map_every_sec, 0.05, 3600.0)?;
+        between("live.map_max_mb", self.live.map_max_mb, 0.01, 1024.0)?;
+        one_of("live.transport", &self.live.transport, &["auto", "raw", "compressed"])?;
+        one_of("live.reliability", &self.live.reliability, &["sensor_data", "reliable"])?;
         one_of("input.rectified", &self.input.rectified, &["auto", "yes", "no"])?;
         one_of("model.device", &self.model.device, &["cpu", "cuda", "metal"])?;
         for x in &self.input.image_time_offset_sec {

@@ -6,6 +6,8 @@ use serde::Serialize;
 use storm_model::scene::{RenderedView, Scene};
 
 use crate::config::SkipConfig;
+use crate::overlap::Agreement;
+use crate::pipeline::step::Demand;
 use crate::source::Frame;
 use crate::window::{PosedSet, Window};
 
@@ -29,6 +31,10 @@ pub struct Computed {
     pub scene: Arc<Scene>,
     /// The newest cameras' views.
     pub views: Arc<[RenderedView]>,
+    /// How far it agreed with the windows before.
+    pub agreement: Arc<Agreement>,
+    /// What was worked out.
+    pub demand: Demand,
 }
 
 /// What to do with a window.
@@ -66,10 +72,12 @@ impl Skipper {
         Self { config: config.clone(), contract: Contract::new(config), last: None, still: 0 }
     }
 
-    /// What to do with this window.
-    pub fn plan(&mut self, window: &Window<Frame>) -> Plan {
+    /// What to do with this window, of which this is wanted.
+    pub fn plan(&mut self, window: &Window<Frame>, demand: Demand) -> Plan {
         let compute = Plan::Compute { check: false };
-        let Some(last) = self.last.as_ref().filter(|_| self.config.still) else { return compute };
+        let Some(last) = self.last.as_ref().filter(|last| self.config.still && last.demand.covers(demand)) else {
+            return compute;
+        };
         if same(&self.config, &last.window, window).is_err() {
             return compute;
         }

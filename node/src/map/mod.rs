@@ -341,11 +341,16 @@ impl StaticMap {
     /// # Errors
     /// A tile on disk that cannot be read.
     pub fn changed_since(&self, revision: u64) -> Result<Vec<(TileIndex, MapCloud)>, MapError> {
+        self.changed_tiles(revision).into_iter().map(|index| Ok((index, self.tile_cloud(&index)?))).collect()
+    }
+
+    /// Which tiles [`StaticMap::changed_since`] would give.
+    pub fn changed_tiles(&self, revision: u64) -> Vec<TileIndex> {
         let here = self.tiles.iter().map(|t| (t.index, t.revision));
         let away = self.away().map(|(index, revision, _)| (index, revision));
         let mut changed: Vec<TileIndex> = here.chain(away).filter(|(_, r)| *r > revision).map(|(i, _)| i).collect();
         changed.sort_unstable();
-        changed.into_iter().map(|index| Ok((index, self.tile_cloud(&index)?))).collect()
+        changed
     }
 
     /// The whole map as plain arrays, sorted by tile and voxel. When it has more than `map.max_written` Gaussians,

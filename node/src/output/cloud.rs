@@ -18,9 +18,9 @@ const FLOAT32: u8 = 7;
 /// ROS data type code of uint8.
 const UINT8: u8 = 2;
 /// ROS data type code of uint16.
-const UINT16: u8 = 4;
+pub(super) const UINT16: u8 = 4;
 /// ROS data type code of uint32.
-const UINT32: u8 = 6;
+pub(super) const UINT32: u8 = 6;
 
 /// Track number of a Gaussian that belongs to no trajectory.
 pub const NO_TRACK: u32 = u32::MAX;
@@ -86,17 +86,17 @@ pub struct BuiltCloud {
 }
 
 /// Lays columns out one after the other, each aligned to its own size.
-struct Layout {
+pub(super) struct Layout {
     fields: Vec<PointField>,
     end: u32,
 }
 
 impl Layout {
-    fn new() -> Self {
+    pub(super) fn new() -> Self {
         Self { fields: Vec::new(), end: 0 }
     }
 
-    fn column(mut self, name: &str, datatype: u8) -> Self {
+    pub(super) fn column(mut self, name: &str, datatype: u8) -> Self {
         let size = match datatype {
             UINT8 => 1,
             UINT16 => 2,
@@ -108,17 +108,17 @@ impl Layout {
         self
     }
 
-    fn floats(self, names: &[&str]) -> Self {
+    pub(super) fn floats(self, names: &[&str]) -> Self {
         names.iter().fold(self, |layout, name| layout.column(name, FLOAT32))
     }
 
     /// Rows are padded to 4 bytes so that float columns stay aligned in an array of points.
-    fn point_step(&self) -> u32 {
+    pub(super) fn point_step(&self) -> u32 {
         self.end.next_multiple_of(4)
     }
 }
 
-const GEOMETRY: [&str; 8] = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
+pub(super) const GEOMETRY: [&str; 8] = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
 
 /// Colour as RViz and PCL read it: 0x00RRGGBB seen as a float32, which is always finite.
 pub fn pack_rgb(color01: [f32; 3]) -> f32 {
@@ -130,16 +130,21 @@ fn check(what: &'static str, expected: usize, got: usize) -> Result<(), OutputEr
     if expected == got { Ok(()) } else { Err(OutputError::Length { what, expected, got }) }
 }
 
-fn put(data: &mut Vec<u8>, values: &[f32]) {
+pub(super) fn put(data: &mut Vec<u8>, values: &[f32]) {
     values.iter().for_each(|v| data.extend_from_slice(&v.to_le_bytes()));
 }
 
-fn finite(groups: &[&[f32]]) -> bool {
+pub(super) fn finite(groups: &[&[f32]]) -> bool {
     groups.iter().all(|g| g.iter().all(|v| v.is_finite()))
 }
 
 /// An unorganised cloud from its rows.
-fn unorganised(header: Header, layout: Layout, data: Vec<u8>, total: usize) -> Result<BuiltCloud, OutputError> {
+pub(super) fn unorganised(
+    header: Header,
+    layout: Layout,
+    data: Vec<u8>,
+    total: usize,
+) -> Result<BuiltCloud, OutputError> {
     let point_step = layout.point_step();
     let count = data.len() / point_step as usize;
     // Size fields are 32-bit on the wire.

@@ -4,6 +4,7 @@ pub mod atomic;
 pub mod bag_metadata;
 pub mod bag_writer;
 pub mod cloud;
+pub mod cloud_live;
 pub mod error;
 pub mod objects_csv;
 pub mod picture;

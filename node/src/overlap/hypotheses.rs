@@ -134,7 +134,7 @@ fn see<'a>(scene: &Scene, pictures: &'a [Picture], p: Vec3) -> Option<Place<'a>>
     pictures.iter().find_map(|picture| {
         let c = picture.camera_from_anchor.transform_point3(p);
         let k = &picture.intrinsics;
-        if !(c.z > NEAR_M) {
+        if c.z.is_nan() || c.z <= NEAR_M {
             return None;
         }
         let (u, v) = (k.fx * c.x / c.z + k.cx, k.fy * c.y / c.z + k.cy);

@@ -6,11 +6,14 @@ use std::sync::Arc;
 use tracing::warn;
 
 use crate::config::Config;
+use crate::extrinsics;
+use crate::rigid::Rigid;
 use crate::source::Rig;
 use crate::source::event::{Event, Frame, Truth};
 use crate::source::topics::TruthKind;
-use crate::sync::{DropCounts, Synchronizer};
-use crate::window::{PosedSet, Window, WindowBuilder};
+use crate::sync::clock::unsigned_ns;
+use crate::sync::{DropCounts, DropReason, Synchronizer};
+use crate::window::{PosedSet, Window, WindowBuilder, WindowCounts};
 
 use super::posed::{PoseStage, PoseStore};
 
@@ -52,13 +55,22 @@ pub struct Front {
     window: WindowBuilder<Frame>,
     lost: DropCounts,
     messages_lost: u64,
-    now_ns: i64,
+    /// Newest stamp of the present time base; none before the first message.
+    now_ns: Option<i64>,
+    jump_forward_ns: u64,
+    epoch: u32,
     starved: bool,
     names: Vec<String>,
+    /// Which cameras of the rig there are.
+    active: Vec<usize>,
+    each_set: bool,
+    /// Sets kept since the last window was asked for.
+    fresh: u64,
+    superseded: u64,
 }
 
 impl Front {
-    /// For the cameras of `rig` and poses from `store`.
+    /// For the cameras of `rig` and poses from `store`; a window for every set that ends one.
     pub fn new(config: &Config, rig: &Rig, store: PoseStore) -> Self {
         Self {
             sync: Synchronizer::new(rig.cameras.len(), &config.sync, &config.input.image_time_offset_sec),
@@ -66,27 +78,88 @@ impl Front {
             window: WindowBuilder::new(&config.window, rig.reference),
             lost: DropCounts::default(),
             messages_lost: 0,
-            now_ns: i64::MIN,
+            now_ns: None,
+            jump_forward_ns: unsigned_ns(config.sync.jump_forward_sec),
+            epoch: 0,
             starved: false,
             names: rig.cameras.iter().map(|c| c.topic.clone()).collect(),
+            active: (0..rig.cameras.len()).collect(),
+            each_set: true,
+            fresh: 0,
+            superseded: 0,
         }
+    }
+
+    /// The same, but windows are given only when [`Front::newest_window`] asks: what cannot keep up takes the newest.
+    pub fn on_demand(config: &Config, rig: &Rig, store: PoseStore) -> Self {
+        Self { each_set: false, ..Self::new(config, rig, store) }
+    }
+
+    /// Goes on with `active` cameras of the rig alone, in rising order. When all of them were there before, windows go on
+    /// at once; else the window fills anew. Images of the other cameras are dropped as incomplete.
+    pub fn with_cameras(self, config: &Config, rig: &Rig, active: &[usize]) -> Self {
+        let offsets: Vec<f64> =
+            active.iter().map(|&c| config.input.image_time_offset_sec.get(c).copied().unwrap_or(0.0)).collect();
+        let mounts: Vec<Rigid> = active.iter().map(|&c| rig.cameras[c].base_from_camera).collect();
+        let reference = active
+            .iter()
+            .position(|&c| c == rig.reference)
+            .or_else(|| extrinsics::reference_camera(&mounts))
+            .unwrap_or(0);
+        let place = |c: &usize| self.active.iter().position(|a| a == c);
+        let kept: Option<Vec<usize>> = active.iter().map(place).collect();
+        Self {
+            sync: self.sync.with_cameras(active.len(), &config.sync, &offsets),
+            posed: self.posed.with_cameras(mounts, &config.sync),
+            window: self.window.with_cameras(reference, kept.as_deref()),
+            names: active.iter().map(|&c| rig.cameras[c].topic.clone()).collect(),
+            active: active.to_vec(),
+            ..self
+        }
+    }
+
+    /// Starts anew, as after a clock jump: sync, window and poses are empty.
+    pub fn reset(&mut self) {
+        self.sync.reset();
+        self.window.reset();
+        self.posed.clear();
+        (self.now_ns, self.epoch, self.fresh) = (None, self.sync.epoch(), 0);
+    }
+
+    /// Least time between two windows from now on, seconds.
+    pub fn set_hop(&mut self, hop_sec: f64) {
+        self.window.set_hop(hop_sec);
+    }
+
+    /// The cameras of the rig there are, in the order of a window's frames.
+    pub fn active(&self) -> &[usize] {
+        &self.active
     }
 
     /// Takes one event and gives what became ready, in order.
     pub fn take(&mut self, event: Event, out: &mut VecDeque<FrontOutput>) {
         match event {
-            Event::Image { camera, stamp_ns, frame } => {
-                self.now_ns = self.now_ns.max(stamp_ns);
-                self.sync.push(camera, stamp_ns, frame);
-            }
+            Event::Image { camera, stamp_ns, frame } => match self.active.iter().position(|&c| c == camera) {
+                Some(camera) => {
+                    self.sync.push(camera, stamp_ns, frame);
+                    if self.sync.epoch() == self.epoch {
+                        self.heard(stamp_ns);
+                    } else {
+                        // The clock has jumped: what was the newest stamp is of a time that is over.
+                        (self.now_ns, self.epoch) = (Some(stamp_ns), self.sync.epoch());
+                    }
+                }
+                None => self.lost.add(DropReason::Incomplete, 1),
+            },
             Event::Pose { stamp_ns, map_from_base } => {
-                self.now_ns = self.now_ns.max(stamp_ns);
+                self.heard(stamp_ns);
                 self.posed.push_pose(stamp_ns, map_from_base);
             }
             Event::Transform(t) => {
-                self.now_ns = self.now_ns.max(t.header.stamp_ns);
-                self.posed.push_transform(&t);
+                self.heard(t.header.stamp_ns);
+                self.posed.push_transform(&t, false);
             }
+            Event::StaticTransform(t) => self.posed.push_transform(&t, true),
             Event::Truth { camera, stamp_ns, kind, width, height, data } => {
                 let image = TruthImage { width, height, data };
                 out.push_back(FrontOutput::Truth { camera, stamp_ns, kind, image });
@@ -100,9 +173,32 @@ impl Front {
                 }
             }
         }
-        self.sync.advance(self.now_ns);
-        self.report_starvation();
+        if let Some(now_ns) = self.now_ns {
+            self.sync.advance(now_ns);
+            self.report_starvation(now_ns);
+        }
         self.drain(out);
+    }
+
+    /// A message with this stamp came in. A stamp far ahead moves the time on only when it is an image's and the next one
+    /// agrees (then the synchronizer starts a new epoch): a single wrong stamp must not make everything else too old.
+    fn heard(&mut self, stamp_ns: i64) {
+        match self.now_ns {
+            Some(now_ns) if stamp_ns > now_ns && stamp_ns.abs_diff(now_ns) > self.jump_forward_ns => {}
+            Some(now_ns) => self.now_ns = Some(now_ns.max(stamp_ns)),
+            None => self.now_ns = Some(stamp_ns),
+        }
+    }
+
+    /// The window that ends at the newest set, if there is one and it was not given yet.
+    pub fn newest_window(&mut self) -> Option<Window<Frame>> {
+        let fresh = std::mem::take(&mut self.fresh);
+        if fresh == 0 {
+            return None;
+        }
+        let window = self.window.newest()?;
+        self.superseded += fresh - 1;
+        Some(window)
     }
 
     /// The input has ended: whatever can still be emitted is.
@@ -117,20 +213,22 @@ impl Front {
             self.starved = false;
             self.posed.push_set(set);
         }
-        while let Some(set) = self.posed.pop(self.now_ns) {
+        while let Some(set) = self.now_ns.and_then(|now_ns| self.posed.pop(now_ns)) {
             // Pictures are shared, so the copy is cheap.
             out.push_back(FrontOutput::Set(Arc::new(set.clone())));
-            if let Some(window) = self.window.push(set) {
+            if !self.each_set {
+                self.fresh += u64::from(self.window.keep(set));
+            } else if let Some(window) = self.window.push(set) {
                 out.push_back(FrontOutput::Window(window));
             }
         }
     }
 
-    fn report_starvation(&mut self) {
+    fn report_starvation(&mut self, now_ns: i64) {
         if self.starved {
             return;
         }
-        if let Some(report) = self.sync.starvation(self.now_ns) {
+        if let Some(report) = self.sync.starvation(now_ns) {
             self.starved = true;
             warn!("no synchronized set: {}", report.describe(&self.names));
         }
@@ -159,8 +257,23 @@ impl Front {
         self.posed.rejected()
     }
 
+    /// What became of the sets that might have made a window.
+    pub fn window_counts(&self) -> WindowCounts {
+        self.window.counts()
+    }
+
+    /// Sets that got no window of their own because a newer one was there when the last step had ended.
+    pub fn superseded(&self) -> u64 {
+        self.superseded
+    }
+
+    /// The number of clock jumps and resets so far.
+    pub fn epoch(&self) -> u32 {
+        self.epoch
+    }
+
     /// The pose stage, for turning camera poses into vehicle poses.
-    pub fn base_pose(&self, camera: usize, map_from_camera: &crate::rigid::Rigid) -> crate::rigid::Rigid {
+    pub fn base_pose(&self, camera: usize, map_from_camera: &Rigid) -> Rigid {
         self.posed.base_pose(camera, map_from_camera)
     }
 }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use crate::engine::score::Scores;
+use crate::gate::skipper::SkipCounts;
 use crate::map::MapCounts;
 use crate::objects::ObjectCounts;
 use crate::overlap::OverlapCounts;
@@ -61,8 +62,10 @@ pub struct Metrics {
     pub frames_in: u64,
     /// Steps run.
     pub steps: u64,
-    /// Steps skipped because the scene did not need them. Nothing is skipped yet.
+    /// Steps among them that were not computed because the scene did not need it.
     pub steps_skipped: u64,
+    /// How skipped steps were checked.
+    pub skips: SkipCounts,
     /// Images dropped, by reason; every reason is listed.
     pub dropped: BTreeMap<String, u64>,
     /// Poses, transforms and ground truth that could not be read.

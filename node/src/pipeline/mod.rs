@@ -1,9 +1,13 @@
-//! The stages wired together: `front` (sync, poses, window), the engine, and the sink (map, tracks, files).
+//! The stages wired together: `front` (sync, poses, window), the engine, and what takes the results: files
+//! (`sink`, driven by `replay`) or whoever listens (`live`).
 
 pub mod front;
+pub mod live;
+pub mod messages;
 pub mod metrics;
 pub mod posed;
 pub mod replay;
+pub mod saver;
 pub mod sink;
 pub mod step;
 pub mod timing;

@@ -9,7 +9,7 @@ use crate::rigid::Rigid;
 use crate::source::Rig;
 use crate::source::bag::BagSource;
 use crate::source::topics::PoseTopic;
-use crate::sync::{DropCounts, FrameSet};
+use crate::sync::{DropCounts, DropReason, FrameSet};
 use crate::tf::TfTree;
 use crate::window::PosedSet;
 
@@ -42,6 +42,11 @@ impl PoseStore {
                 base: rig.base_frame.clone(),
             },
         }
+    }
+
+    /// Empty.
+    pub fn nothing(config: &SyncConfig) -> Self {
+        Self::Buffer(PoseBuffer::new(config))
     }
 
     fn lookup(&self, stamp_ns: i64) -> PoseLookup {
@@ -77,10 +82,10 @@ impl<T> PoseStage<T> {
         }
     }
 
-    /// A transform of the tree.
-    pub fn push_transform(&mut self, transform: &TransformStamped) {
+    /// A transform of the tree; `is_static`: it holds at all times.
+    pub fn push_transform(&mut self, transform: &TransformStamped, is_static: bool) {
         if let PoseStore::Tree { tree, .. } = &mut self.store
-            && let Err(e) = tree.insert(transform, false)
+            && let Err(e) = tree.insert(transform, is_static)
         {
             self.reject(&format!("transform at {} ns refused: {e}", transform.header.stamp_ns));
         }
@@ -119,6 +124,15 @@ impl<T> PoseStage<T> {
         })
     }
 
+    /// Forgets all poses (transforms that hold at all times stay) and drops the sets that wait.
+    pub fn clear(&mut self) {
+        match &mut self.store {
+            PoseStore::Buffer(poses) => poses.clear(),
+            PoseStore::Tree { tree, .. } => tree.clear_moving(),
+        }
+        self.gate.flush();
+    }
+
     /// The input has ended: sets that still wait are dropped.
     pub fn flush(&mut self) {
         self.gate.flush();
@@ -127,6 +141,14 @@ impl<T> PoseStage<T> {
     /// The vehicle's pose a camera pose stands for.
     pub fn base_pose(&self, camera: usize, map_from_camera: &Rigid) -> Rigid {
         self.base_from_camera.get(camera).map_or(*map_from_camera, |m| *map_from_camera * m.inverse())
+    }
+
+    /// The same poses for other cameras: `base_from_camera` are their mountings. Sets that wait go, since they are not
+    /// of these cameras; they are counted as incomplete.
+    pub fn with_cameras(self, base_from_camera: Vec<Rigid>, config: &SyncConfig) -> Self {
+        let mut drops = self.gate.drops().clone();
+        drops.add(DropReason::Incomplete, self.gate.pending() as u64);
+        Self { gate: PoseGate::after(config, drops), base_from_camera, ..self }
     }
 
     /// Images dropped here, by reason.

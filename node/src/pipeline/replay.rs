@@ -21,6 +21,7 @@ use crate::source::{Event, Rig};
 use super::front::{Front, FrontOutput};
 use super::metrics::{Counts, Metrics};
 use super::posed::PoseStore;
+use super::saver::Saver;
 use super::sink::{Sink, SinkInput};
 use super::step::{Finished, StepMaker};
 
@@ -156,7 +157,7 @@ fn step_all(
     let store = PoseStore::of_bag(source, rig, config);
     let mut front = Front::new(config, rig, store);
     let mut maker = StepMaker::new(engine, rig.intrinsics(), config, Some(&options.out.join(MAP_FOLDER)))?;
-    let mut saver = Saver { every_sec: config.map.save_every_sec, last: Instant::now(), failed: 0 };
+    let mut saver = Saver::new(config.map.save_every_sec);
     let batch = options.batch.max(1);
     let mut ready = VecDeque::new();
     for event in events {
@@ -171,32 +172,7 @@ fn step_all(
     front.finish(&mut ready);
     hand_on(&mut ready, &front, &mut maker, to_sink)?;
     saver.save(&mut maker);
-    Ok((front, Finished { map_saves_failed: saver.failed, batch, ..maker.finish() }))
-}
-
-/// Saves the map every so often of wall time: what a killed run loses is time somebody waited. When it happens changes
-/// nothing in the map.
-struct Saver {
-    every_sec: f64,
-    last: Instant,
-    failed: u64,
-}
-
-impl Saver {
-    fn offer(&mut self, maker: &mut StepMaker) {
-        if self.every_sec > 0.0 && self.last.elapsed().as_secs_f64() >= self.every_sec {
-            self.save(maker);
-        }
-    }
-
-    /// A save that fails is said and counted; the run goes on.
-    fn save(&mut self, maker: &mut StepMaker) {
-        if let Err(e) = maker.save_map() {
-            self.failed += 1;
-            warn!("the map could not be saved: {e}");
-        }
-        self.last = Instant::now();
-    }
+    Ok((front, Finished { map_saves_failed: saver.failed(), batch, ..maker.finish() }))
 }
 
 /// Runs windows (all of them in one forward pass), passes the rest through; false when the writer has gone.

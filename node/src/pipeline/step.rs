@@ -12,6 +12,7 @@ use tracing::warn;
 
 use crate::config::Config;
 use crate::engine::{Engine, select, views_of};
+use crate::gate::skipper::{Computed, Plan, SkipCounts, Skipper};
 use crate::map::{MapError, SceneLook, StaticMap};
 use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
 use crate::overlap::{Agreement, Overlap, OverlapCounts, OverlapLook};
@@ -35,9 +36,9 @@ pub struct Step {
     /// Gaussians in the anchor frame, sky and exposure.
     pub scene: Arc<Scene>,
     /// The newest timestep's cameras as the scene shows them.
-    pub views: Vec<RenderedView>,
+    pub views: Arc<[RenderedView]>,
     /// How far this window and earlier ones agree about its Gaussians.
-    pub agreement: Agreement,
+    pub agreement: Arc<Agreement>,
     /// Milliseconds from window to here.
     pub total_ms: f64,
 }
@@ -52,6 +53,32 @@ pub struct StepResult {
     pub objects: Vec<MovingObject>,
 }
 
+/// What somebody wants of a step; nothing else is worked out. The map and the Gaussians always are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Demand {
+    /// Motion groups in the pictures (the motion masks).
+    pub motion: bool,
+    /// Point trajectories.
+    pub tracks: bool,
+    /// Moving objects.
+    pub objects: bool,
+    /// The static map, and with it the pictures (the map is judged by them).
+    pub map: bool,
+    /// The pictures, although there is no map.
+    pub pictures: bool,
+}
+
+impl Demand {
+    /// Everything.
+    pub const ALL: Self = Self { motion: true, tracks: true, objects: true, map: true, pictures: true };
+
+    /// Whether what was worked out for this is enough for `other`.
+    pub fn covers(&self, other: Self) -> bool {
+        let pictures = self.pictures || self.map;
+        (self.motion || !other.motion) && (pictures || !other.pictures) && (self.map || !other.map)
+    }
+}
+
 /// Runs steps; owns the network, the map and the trackers.
 pub struct StepMaker {
     engine: Engine,
@@ -61,6 +88,7 @@ pub struct StepMaker {
     tracker: Tracker,
     objects: ObjectTracker,
     overlap: Overlap,
+    skipper: Skipper,
     timings: Timings,
     steps: u64,
     non_finite: u64,
@@ -91,6 +119,7 @@ impl StepMaker {
             tracker: Tracker::new(&config.tracks),
             objects: ObjectTracker::new(&config.objects),
             overlap: Overlap::new(&config.overlap),
+            skipper: Skipper::new(&config.skip),
             config: config.clone(),
             timings: Timings::default(),
             steps: 0,
@@ -98,39 +127,108 @@ impl StepMaker {
         })
     }
 
-    /// Runs one window. `None` when the network's result was not finite: the window is dropped, counted and said.
+    /// Goes on with other cameras, in the order of the windows' frames.
+    pub fn set_cameras(&mut self, cameras: Vec<Intrinsics>) {
+        self.skipper.reset();
+        self.cameras = cameras;
+    }
+
+    /// Takes another map, in the place of the present one, which goes.
+    pub fn set_map(&mut self, map: StaticMap) {
+        self.skipper.reset();
+        self.map = map;
+    }
+
+    /// The map.
+    pub fn map(&self) -> &StaticMap {
+        &self.map
+    }
+
+    /// Trajectories alive.
+    pub fn tracks(&self) -> &[Track] {
+        self.tracker.live()
+    }
+
+    /// Objects alive that were seen often enough to be believed.
+    pub fn objects(&self) -> impl Iterator<Item = &MovingObject> {
+        self.objects.live().iter().filter(|o| o.confirmed(&self.config.objects))
+    }
+
+    /// Stage times so far.
+    pub fn timings(&self) -> &Timings {
+        &self.timings
+    }
+
+    /// Windows whose result was not finite and was thrown away.
+    pub fn non_finite(&self) -> u64 {
+        self.non_finite
+    }
+
+    /// Steps that were not computed, and how the checks of them went.
+    pub fn skips(&self) -> SkipCounts {
+        self.skipper.counts()
+    }
+
+    /// Skips allowed between two checks at present; 0: none.
+    pub fn skip_level(&self) -> u64 {
+        self.skipper.level()
+    }
+
+    /// The network, for what it says of itself.
+    pub fn engine(&self) -> &Engine {
+        &self.engine
+    }
+
+    /// Runs one window with everything. `None` when the network's result was not finite: the window is dropped, counted and said.
     pub fn run(&mut self, window: Window<Frame>) -> Result<Option<Step>> {
+        self.run_for(window, Demand::ALL)
+    }
+
+    /// The same, with no more than `demand` asks for. A window that shows what the last computed one showed takes its result
+    /// (see [`crate::gate`]).
+    pub fn run_for(&mut self, window: Window<Frame>, demand: Demand) -> Result<Option<Step>> {
+        let plan = self.timings.time("gate", || self.skipper.plan(&window, demand));
+        let check = match plan {
+            Plan::Reuse(again) => return Ok(Some(self.again(window, again, demand))),
+            Plan::Compute { check } => check,
+        };
         let start = Instant::now();
         let scene = self.engine.step(&window, &self.cameras);
-        self.take_in(window, scene, start.elapsed().as_secs_f64() * 1e3)
+        self.take_in(window, scene, start.elapsed().as_secs_f64() * 1e3, demand, check)
     }
 
     /// Runs windows that follow each other, the network on all of them in one forward pass, the rest one by one. In
-    /// order, one result each.
-    pub fn run_all(&mut self, windows: Vec<Window<Frame>>) -> Result<Vec<StepResult>> {
+    /// order, one result each. Several windows at once are all computed.
+    pub fn run_all(&mut self, mut windows: Vec<Window<Frame>>) -> Result<Vec<StepResult>> {
+        if windows.len() <= 1 {
+            let Some(window) = windows.pop() else { return Ok(Vec::new()) };
+            let step = self.run(window)?;
+            return Ok(vec![self.result(step)]);
+        }
         let start = Instant::now();
         let scenes = self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras)?;
-        let network_ms = start.elapsed().as_secs_f64() * 1e3 / windows.len().max(1) as f64;
+        let network_ms = start.elapsed().as_secs_f64() * 1e3 / windows.len() as f64;
         let all = windows.into_iter().zip(scenes);
         all.map(|(window, scene)| {
-            let step = self.take_in(window, scene, network_ms)?;
-            Ok(StepResult { step, tracks: self.ended_tracks(), objects: self.ended_objects() })
+            let step = self.take_in(window, scene, network_ms, Demand::ALL, false)?;
+            Ok(self.result(step))
         })
         .collect()
     }
 
-    /// Moving objects that have ended since the last call.
-    pub fn ended_objects(&mut self) -> Vec<MovingObject> {
-        self.objects.drain()
+    fn result(&mut self, step: Option<Step>) -> StepResult {
+        StepResult { step, tracks: self.ended_tracks(), objects: self.ended_objects() }
     }
 
-    /// Trajectories that have ended since the last call.
-    pub fn ended_tracks(&mut self) -> Vec<Track> {
-        self.tracker.drain()
-    }
-
-    /// What follows the network. `network_ms` is this window's share of its time.
-    fn take_in(&mut self, window: Window<Frame>, scene: Result<Scene>, network_ms: f64) -> Result<Option<Step>> {
+    /// What follows the network. `network_ms` is this window's share of its time; `check` belongs to the gate.
+    fn take_in(
+        &mut self,
+        window: Window<Frame>,
+        scene: Result<Scene>,
+        network_ms: f64,
+        demand: Demand,
+        check: bool,
+    ) -> Result<Option<Step>> {
         let start = Instant::now();
         self.timings.add("network", network_ms);
         let mut scene = match scene {
@@ -155,36 +253,88 @@ impl StepMaker {
         };
         let agreement = self.timings.time("overlap", || self.overlap.step(&mut scene, &look));
         let newest = window.steps.len() - 1;
-        let views = {
+        let views = if demand.pictures || demand.map {
             let targets = views_of(&window.steps[newest], &window.map_from_anchor, &self.cameras);
             let time_sec = newest_time_sec(&window);
-            let want = Want { flow: true, motion: true };
+            let want = Want { flow: true, motion: demand.motion };
             self.timings.time("render", || self.engine.render(&scene, &targets, time_sec, want))?
+        } else {
+            Vec::new()
         };
-        let look = SceneLook {
-            stamp_ns: window.stamp_ns,
-            map_from_anchor: &window.map_from_anchor,
-            scene: &scene,
-            cameras: &self.cameras,
-            poses: &poses,
-            rendered: &views,
-            confidence: &agreement.geometry,
-            first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
-        };
-        self.timings.time("map", || self.map.fuse_scene(&look));
-        let mut points = select::moving_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
-        for p in &mut points {
-            let known = self.map.evidence(p.position_map);
-            p.may_start = known.is_none_or(|k| f64::from(k.seen_for_sec) < STANDS_SEC);
+        if demand.map {
+            let look = SceneLook {
+                stamp_ns: window.stamp_ns,
+                map_from_anchor: &window.map_from_anchor,
+                scene: &scene,
+                cameras: &self.cameras,
+                poses: &poses,
+                rendered: &views,
+                confidence: &agreement.geometry,
+                first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
+            };
+            self.timings.time("map", || self.map.fuse_scene(&look));
+        } else {
+            // What is published relative to the map's origin needs one all the same.
+            self.map.set_origin(window.map_from_anchor.translation);
         }
-        self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
-        let (_, parts) = select::object_points(&scene, newest, &window.map_from_anchor, &self.config.tracks);
-        self.timings.time("objects", || self.objects.step(window.stamp_ns, window.epoch, &parts));
+        let (scene, views, agreement) = (Arc::new(scene), Arc::from(views), Arc::new(agreement));
+        let computed = Computed { window, scene, views, agreement, demand };
+        self.skipper.computed(&computed, check);
+        self.follow(&computed.scene, &computed.window, demand);
+        let Computed { window, scene, views, agreement, .. } = computed;
         let total_ms = network_ms + start.elapsed().as_secs_f64() * 1e3;
+        Ok(Some(self.step(window, scene, views, agreement, total_ms)))
+    }
+
+    /// A window that shows what `last` showed: its result, with the new stamps. The map is told nothing, having been told.
+    fn again(&mut self, window: Window<Frame>, last: Computed, demand: Demand) -> Step {
+        let start = Instant::now();
+        // The cameras stand; where they stood is where the Gaussians are.
+        let window = Window { map_from_anchor: last.window.map_from_anchor, ..window };
+        self.follow(&last.scene, &window, demand);
+        let total_ms = start.elapsed().as_secs_f64() * 1e3;
+        self.step(window, last.scene, last.views, last.agreement, total_ms)
+    }
+
+    /// What moves, into the trajectories and the objects.
+    fn follow(&mut self, scene: &Scene, window: &Window<Frame>, demand: Demand) {
+        let newest = window.steps.len() - 1;
+        if demand.tracks {
+            let mut points = select::moving_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
+            for p in &mut points {
+                let known = self.map.evidence(p.position_map);
+                p.may_start = known.is_none_or(|k| f64::from(k.seen_for_sec) < STANDS_SEC);
+            }
+            self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
+        }
+        if demand.objects {
+            let (_, parts) = select::object_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
+            self.timings.time("objects", || self.objects.step(window.stamp_ns, window.epoch, &parts));
+        }
+    }
+
+    fn step(
+        &mut self,
+        window: Window<Frame>,
+        scene: Arc<Scene>,
+        views: Arc<[RenderedView]>,
+        agreement: Arc<Agreement>,
+        total_ms: f64,
+    ) -> Step {
         self.timings.add("step", total_ms);
         let index = self.steps;
         self.steps += 1;
-        Ok(Some(Step { index, window, scene: Arc::new(scene), views, agreement, total_ms }))
+        Step { index, window, scene, views, agreement, total_ms }
+    }
+
+    /// Moving objects that have ended since the last call.
+    pub fn ended_objects(&mut self) -> Vec<MovingObject> {
+        self.objects.drain()
+    }
+
+    /// Trajectories that have ended since the last call.
+    pub fn ended_tracks(&mut self) -> Vec<Track> {
+        self.tracker.drain()
     }
 
     /// Saves the map where its folder is; nothing to do for a map in memory.
@@ -209,6 +359,7 @@ impl StepMaker {
             objects,
             object_counts: self.objects.counts(),
             overlap: self.overlap.counts(),
+            skips: self.skipper.counts(),
             timings: self.timings,
             steps: self.steps,
             non_finite_windows: self.non_finite,
@@ -232,6 +383,8 @@ pub struct Finished {
     pub object_counts: ObjectCounts,
     /// What overlapping windows said of each other.
     pub overlap: OverlapCounts,
+    /// Steps that were not computed.
+    pub skips: SkipCounts,
     /// Stage times.
     pub timings: Timings,
     /// Steps run.

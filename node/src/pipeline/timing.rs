@@ -14,6 +14,9 @@ pub struct StageStats {
     pub p99: f64,
 }
 
+/// Times kept per stage; beyond it the older half goes, so that a node may run for weeks.
+const MAX_TIMES: usize = 1 << 16;
+
 /// Milliseconds per stage, one entry per run of the stage.
 #[derive(Debug, Clone, Default)]
 pub struct Timings {
@@ -31,7 +34,16 @@ impl Timings {
 
     /// Books `ms` under `stage`.
     pub fn add(&mut self, stage: &'static str, ms: f64) {
-        self.stages.entry(stage).or_default().push(ms as f32);
+        let times = self.stages.entry(stage).or_default();
+        if times.len() >= MAX_TIMES {
+            times.drain(..MAX_TIMES / 2);
+        }
+        times.push(ms as f32);
+    }
+
+    /// The newest time of every stage, milliseconds.
+    pub fn last(&self) -> impl Iterator<Item = (&'static str, f64)> + '_ {
+        self.stages.iter().filter_map(|(stage, ms)| Some((*stage, f64::from(*ms.last()?))))
     }
 
     /// Takes over all of `other`'s entries.
@@ -64,7 +76,7 @@ pub fn cpu_ms() -> Option<f64> {
     let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `time` is valid for the write, which is all that the call does.
     let failed = unsafe { libc::clock_gettime(libc::CLOCK_PROCESS_CPUTIME_ID, &raw mut time) };
-    (failed == 0).then(|| time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6)
+    (failed == 0).then_some(time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6)
 }
 
 /// Time all threads of this process have run; not known here.

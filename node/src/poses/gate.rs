@@ -26,6 +26,11 @@ impl<T> PoseGate<T> {
         Self { wait_ns: signed_ns(config.pose_wait_sec), waiting: VecDeque::new(), drops: DropCounts::default() }
     }
 
+    /// One that goes on counting where another stopped.
+    pub fn after(config: &SyncConfig, drops: DropCounts) -> Self {
+        Self { drops, ..Self::new(config) }
+    }
+
     /// Takes the next set; beyond the bound the oldest one that waits is dropped.
     pub fn push(&mut self, set: FrameSet<T>) {
         self.waiting.push_back(set);

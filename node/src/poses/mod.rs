@@ -64,6 +64,11 @@ impl PoseBuffer {
         }
     }
 
+    /// Forgets all poses.
+    pub fn clear(&mut self) {
+        self.timeline.clear();
+    }
+
     /// What became of the poses so far.
     pub fn counts(&self) -> PoseCounts {
         self.counts

@@ -6,30 +6,20 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use tracing::warn;
 
-use crate::bag::{Bag, RawMessage};
+use crate::bag::Bag;
 use crate::cdr::decode as cdr;
 use crate::config::{Config, SyncConfig};
-use crate::decode::{self, RgbPicture};
 use crate::msg::{CameraInfo, TransformStamped};
 use crate::sync::DropReason;
 use crate::tf::TfTree;
 
-use super::event::{Event, Frame, Truth};
+use super::event::Event;
 use super::rig::{CameraDescription, Rig};
-use super::topics::{PoseTopic, TopicPlan, TruthKind};
+use super::topics::{PoseTopic, TopicPlan};
+use super::translate::{Role, translate};
 
 /// Losses of one topic that are written to the log one by one; the rest is only counted.
 const LOGGED_LOSSES_PER_TOPIC: usize = 5;
-
-/// What a topic's messages are turned into.
-#[derive(Debug, Clone, Copy)]
-enum Role {
-    Image { camera: usize, compressed: bool },
-    Pose,
-    Transform,
-    Truth { camera: usize, kind: TruthKind },
-    None,
-}
 
 /// An opened bag with its topics and cameras resolved.
 pub struct BagSource {
@@ -68,7 +58,9 @@ impl BagSource {
             roles[topic] = Role::Truth { camera, kind };
         }
         match plan.pose {
-            PoseTopic::Message(topic) => roles[topic] = Role::Pose,
+            PoseTopic::Message(topic) => {
+                roles[topic] = Role::Pose { type_name: bag.topics()[topic].type_name.clone() };
+            }
             PoseTopic::Tf => plan.tf.iter().for_each(|&t| roles[t] = Role::Transform),
         }
         Ok(Self { bag, plan, rig: Arc::new(rig), sync: config.sync.clone(), static_transforms, roles })
@@ -119,9 +111,10 @@ impl BagSource {
                     continue;
                 }
             };
-            let role = self.roles.get(message.topic).copied().unwrap_or(Role::None);
+            let role = self.roles.get(message.topic).unwrap_or(&Role::None);
+            let topic = self.topic_name(message.topic);
             let mut go_on = true;
-            self.translate(role, &message, &mut |event| {
+            translate(&self.rig, role, topic, &message.data, message.log_time_ns, &mut |event| {
                 if let Event::Lost { detail, .. } = &event {
                     losses[message.topic] += 1;
                     if losses[message.topic] <= LOGGED_LOSSES_PER_TOPIC {
@@ -136,59 +129,10 @@ impl BagSource {
         }
         Ok(())
     }
-
-    /// Turns one message into events.
-    fn translate(&self, role: Role, message: &RawMessage, each: &mut dyn FnMut(Event)) {
-        let topic = self.bag.topics().get(message.topic).map_or("?", |t| t.name.as_str());
-        let lost = |camera: Option<usize>, stamp_ns: i64, why: String| Event::Lost {
-            camera,
-            reason: DropReason::Decode,
-            detail: format!("{topic} at {stamp_ns} ns: {why}"),
-        };
-        match role {
-            Role::Image { camera, compressed } => match self.picture(camera, compressed, &message.data) {
-                Ok((stamp_ns, rgb)) => {
-                    each(Event::Image { camera, stamp_ns, frame: Frame { rgb: Arc::new(rgb) } });
-                }
-                Err(e) => each(lost(Some(camera), stamp_of(message), format!("{e:#}"))),
-            },
-            Role::Pose => {
-                let type_name = self.bag.topics().get(message.topic).map_or("", |t| t.type_name.as_str());
-                match cdr::pose(type_name, &message.data) {
-                    Ok(p) => each(Event::Pose { stamp_ns: p.header.stamp_ns, map_from_base: p.pose }),
-                    Err(e) => each(lost(None, stamp_of(message), e.to_string())),
-                }
-            }
-            Role::Transform => match cdr::tf_message(&message.data) {
-                Ok(list) => list.into_iter().for_each(|t| each(Event::Transform(Box::new(t)))),
-                Err(e) => each(lost(None, stamp_of(message), e.to_string())),
-            },
-            Role::Truth { camera, kind } => match truth(kind, &message.data) {
-                Ok(event) => each(event.of(camera, kind)),
-                Err(e) => each(lost(None, stamp_of(message), format!("{e:#}"))),
-            },
-            Role::None => {}
-        }
-    }
-
-    fn picture(&self, camera: usize, compressed: bool, data: &[u8]) -> Result<(i64, RgbPicture)> {
-        let (stamp_ns, full) = if compressed {
-            let image = cdr::compressed_image(data)?;
-            (image.header.stamp_ns, decode::compressed_to_rgb(&image)?)
-        } else {
-            let image = cdr::image(data)?;
-            (image.header.stamp_ns, decode::image_to_rgb(&image)?)
-        };
-        Ok((stamp_ns, self.rig.cameras[camera].rectifier.apply(&full)?))
-    }
 }
 
-/// The header stamp when it can be read, else the log time: for messages about messages.
-fn stamp_of(message: &RawMessage) -> i64 {
-    cdr::header(&message.data).map_or(message.log_time_ns, |h| h.stamp_ns)
-}
-
-fn static_tree(sync: &SyncConfig, transforms: &[TransformStamped]) -> TfTree {
+/// A transform tree that holds what /tf_static said; transforms that cannot be used are named in the log.
+pub fn static_tree(sync: &SyncConfig, transforms: &[TransformStamped]) -> TfTree {
     let mut tree = TfTree::new(sync);
     for t in transforms {
         if let Err(e) = tree.insert(t, true) {
@@ -196,31 +140,6 @@ fn static_tree(sync: &SyncConfig, transforms: &[TransformStamped]) -> TfTree {
         }
     }
     tree
-}
-
-struct TruthImage {
-    stamp_ns: i64,
-    width: usize,
-    height: usize,
-    data: Truth,
-}
-
-impl TruthImage {
-    fn of(self, camera: usize, kind: TruthKind) -> Event {
-        let Self { stamp_ns, width, height, data } = self;
-        Event::Truth { camera, stamp_ns, kind, width, height, data: Arc::new(data) }
-    }
-}
-
-fn truth(kind: TruthKind, data: &[u8]) -> Result<TruthImage> {
-    let image = cdr::image(data)?;
-    let (width, height) = (image.width as usize, image.height as usize);
-    let data = match kind {
-        TruthKind::Depth => Truth::Depth(decode::image_to_depth(&image)?.data),
-        TruthKind::Flow => Truth::Flow(decode::image_to_vectors(&image)?),
-        TruthKind::Moving | TruthKind::Sky | TruthKind::Instance => Truth::Mask(decode::image_to_labels(&image)?),
-    };
-    Ok(TruthImage { stamp_ns: image.header.stamp_ns, width, height, data })
 }
 
 /// Reads ahead until every camera is described: CameraInfo, first image's frame, /tf_static, the pose's child frame.

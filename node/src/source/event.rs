@@ -48,6 +48,8 @@ pub enum Event {
     },
     /// A moving transform arrived.
     Transform(Box<msg::TransformStamped>),
+    /// A transform that holds at all times arrived.
+    StaticTransform(Box<msg::TransformStamped>),
     /// A ground-truth image arrived.
     Truth {
         /// Which camera.

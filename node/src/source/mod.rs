@@ -5,6 +5,7 @@ pub mod bag;
 pub mod event;
 pub mod rig;
 pub mod topics;
+pub mod translate;
 pub mod world;
 
 pub use event::{Event, Frame, Truth};

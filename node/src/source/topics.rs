@@ -27,7 +27,7 @@ const NOT_A_PICTURE: [&str; 6] = ["depth", "mask", "disparity", "label", "confid
 #[derive(Debug, Error)]
 pub enum TopicError {
     /// A topic named by the configuration is not in the recording.
-    #[error("{key} names topic {topic}, which the recording does not have; it has: {found}")]
+    #[error("{key} names topic {topic}, which is not there; there are: {found}")]
     Missing {
         /// The configuration key.
         key: &'static str,
@@ -49,7 +49,7 @@ pub enum TopicError {
         wanted: String,
     },
     /// No topic plays this part.
-    #[error("no {part} in the recording; its topics: {found}")]
+    #[error("no {part}; there are: {found}")]
     None {
         /// What was looked for.
         part: &'static str,

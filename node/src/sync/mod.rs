@@ -81,6 +81,16 @@ impl<T> Synchronizer<T> {
         }
     }
 
+    /// One for other cameras that goes on counting where this one stopped, in the same epoch. What waits here is dropped
+    /// as incomplete.
+    pub fn with_cameras(mut self, cameras: usize, config: &SyncConfig, offsets: &[f64]) -> Self {
+        self.drop_waiting(DropReason::Incomplete);
+        self.drops.add(DropReason::Incomplete, self.clock.held() as u64);
+        self.drops.add(DropReason::Incomplete, self.ready.iter().map(|s| s.frames.len() as u64).sum());
+        let (epoch, drops, images_in) = (self.epoch, self.drops, self.images_in);
+        Self { epoch, drops, images_in, ..Self::new(cameras, config, offsets) }
+    }
+
     /// Takes one image. A camera index out of range is counted as [`DropReason::NoCalibration`].
     pub fn push(&mut self, camera: usize, stamp_ns: i64, item: T) {
         self.images_in += 1;

@@ -167,6 +167,15 @@ impl TfTree {
         }
     }
 
+    /// Forgets all moving transforms.
+    pub fn clear_moving(&mut self) {
+        for frame in &mut self.frames {
+            if let Some(Edge { motion: Motion::Moving(timeline), .. }) = &mut frame.edge {
+                timeline.clear();
+            }
+        }
+    }
+
     /// `top_from_frame`, multiplied up from `frame` to its ancestor `top`.
     fn climb(&self, frame: usize, top: usize, stamp_ns: i64) -> TfLookup {
         let (mut at, mut at_from_frame, mut wait) = (frame, Rigid::IDENTITY, None);

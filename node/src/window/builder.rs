@@ -30,6 +30,10 @@ pub struct WindowCounts {
     pub malformed: u64,
 }
 
+fn hop_ns(hop_sec: f64) -> u64 {
+    unsigned_ns(hop_sec * (1.0 - HOP_TOLERANCE))
+}
+
 #[derive(Debug)]
 pub(super) struct Kept<T> {
     pub(super) set: Arc<PosedSet<T>>,
@@ -59,7 +63,7 @@ impl<T> WindowBuilder<T> {
             timesteps: config.timesteps.max(1),
             stride_ns: signed_ns(config.stride_sec).max(1),
             tolerance_ns: unsigned_ns(config.stride_sec * config.stride_tolerance),
-            hop_ns: unsigned_ns(config.hop_sec * (1.0 - HOP_TOLERANCE)),
+            hop_ns: hop_ns(config.hop_sec),
             reference_camera,
             history: VecDeque::new(),
             epoch: None,
@@ -70,11 +74,19 @@ impl<T> WindowBuilder<T> {
         }
     }
 
+    /// Least time between two windows from now on, seconds.
+    pub fn set_hop(&mut self, hop_sec: f64) {
+        self.hop_ns = hop_ns(hop_sec);
+    }
+
     /// Takes the next set; gives the window that ends at it, if there is one.
     pub fn push(&mut self, set: PosedSet<T>) -> Option<Window<T>> {
-        if !self.keep(set) {
-            return None;
-        }
+        if self.keep(set) { self.newest() } else { None }
+    }
+
+    /// The window that ends at the newest set, if there is one. Sets kept before without a window of their own are new in
+    /// it where it holds them.
+    pub fn newest(&mut self) -> Option<Window<T>> {
         let newest_ns = self.history.back()?.set.stamp_ns;
         if self.last_step_ns.is_some_and(|last_ns| newest_ns.abs_diff(last_ns) < self.hop_ns) {
             self.counts.hop += 1;
@@ -89,6 +101,26 @@ impl<T> WindowBuilder<T> {
         self.counts.windows += 1;
         self.last_step_ns = Some(newest_ns);
         self.window(&picks)
+    }
+
+    /// The same windows over other cameras, anchored at `reference_camera` of them. `kept`: which of the cameras so far
+    /// they are, so that the history goes on; none when there is a camera among them that the history lacks.
+    pub fn with_cameras(mut self, reference_camera: usize, kept: Option<&[usize]>) -> Self
+    where
+        T: Clone,
+    {
+        self.reference_camera = reference_camera;
+        match kept {
+            Some(kept) => {
+                for k in &mut self.history {
+                    let frames = kept.iter().filter_map(|&c| k.set.frames.get(c).cloned()).collect();
+                    k.set = Arc::new(PosedSet { frames, ..*k.set });
+                }
+                self.cameras = kept.len();
+            }
+            None => self.reset(),
+        }
+        self
     }
 
     /// Forgets all sets, as a new epoch does.
@@ -109,7 +141,7 @@ impl<T> WindowBuilder<T> {
     }
 
     /// Adds a set to the history and drops what no window can use any more; false when the set is refused.
-    fn keep(&mut self, set: PosedSet<T>) -> bool {
+    pub fn keep(&mut self, set: PosedSet<T>) -> bool {
         let finite = set.frames.iter().all(|f| f.map_from_camera.is_finite());
         if self.epoch != Some(set.epoch) {
             if self.epoch.is_some_and(|epoch| set.epoch < epoch) {

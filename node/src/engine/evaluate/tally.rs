@@ -17,7 +17,7 @@ use crate::engine::figures::Figures;
 use crate::engine::select::{MOVING_MPS, SURFACE_OPACITY};
 use crate::engine::truth::{TruthAt, unit};
 use crate::engine::views_of;
-use crate::pipeline::sink::motion_mask;
+use crate::pipeline::messages::motion_mask;
 use crate::window::relative;
 
 /// Scores of one method over many clips.

@@ -25,7 +25,7 @@ use crate::rigid::Rigid;
 use crate::source::{Frame, Rig};
 use crate::window::PosedSet;
 
-use super::topics::{motion_mask, surface_depth};
+use crate::pipeline::messages::{motion_mask, surface_depth};
 
 /// Speed at which the flow pictures are fully saturated, m/s.
 const FULL_SPEED_MPS: f32 = 15.0;
@@ -59,7 +59,7 @@ struct Shown {
     stamp_ns: i64,
     gaussians: usize,
     total_ms: f64,
-    views: Vec<RenderedView>,
+    views: Arc<[RenderedView]>,
     inputs: Arc<PosedSet<Frame>>,
 }
 
@@ -80,7 +80,7 @@ impl Gallery {
             stamp_ns: step.window.stamp_ns,
             gaussians: step.scene.gaussians.len(),
             total_ms: step.total_ms,
-            views: step.views.clone(),
+            views: Arc::clone(&step.views),
             inputs: newest.clone(),
         });
         if self.kept.len() > 2 * self.limit {

@@ -3,7 +3,7 @@
 mod gallery;
 mod topics;
 
-pub use topics::{ANCHOR_FRAME, ORIGIN_FRAME, PREFIX, Published, Publisher, motion_mask, surface_depth};
+pub use topics::{PREFIX, Publisher};
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,6 +26,7 @@ use crate::tracks::Track;
 use crate::window::PosedSet;
 
 use super::front::TruthImage;
+use super::messages::Published;
 use super::metrics::{Counts, Metrics};
 use super::step::{Finished, Step};
 use super::timing::{Timings, peak_rss_mb};
@@ -216,7 +217,8 @@ impl Sink {
             images_in: counts.images_in,
             frames_in: self.sets,
             steps: finished.steps,
-            steps_skipped: 0,
+            steps_skipped: finished.skips.still,
+            skips: finished.skips,
             dropped: counts.dropped,
             messages_lost: counts.messages_lost,
             poses_rejected: counts.poses_rejected,

@@ -1,0 +1,155 @@
+//! The map topics: `map` holds the whole map for whoever joins, `map_update` the tiles that changed.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use r2r::Node;
+
+use super::publisher::Topic;
+use crate::cdr::encode::encode_point_cloud2;
+use crate::config::LiveConfig;
+use crate::map::{MapCloud, StaticMap, TileIndex};
+use crate::msg::Header;
+use crate::output::cloud;
+use crate::output::cloud_live::tile_cloud;
+use crate::output::qos::Qos;
+use crate::pipeline::messages::{self, ORIGIN_FRAME, Published};
+
+/// The whole map is sent again after so long to those who listen already; a new listener gets it at once.
+const WHOLE_EVERY: Duration = Duration::from_secs(10);
+/// Bytes of a Gaussian in `map` and in `map_update`.
+const WHOLE_BYTES: usize = 48;
+const UPDATE_BYTES: usize = 60;
+
+/// The topics and what was sent on them.
+pub struct MapOutput {
+    whole: Topic,
+    update: Topic,
+    last: Option<Instant>,
+    whole_sent: Option<(Instant, u64)>,
+    whole_listeners: usize,
+    update_listeners: usize,
+    /// Changes up to this revision are sent or in `pending`.
+    seen: u64,
+    pending: BTreeSet<TileIndex>,
+    /// Tiles sent on `map_update`.
+    known: BTreeSet<TileIndex>,
+}
+
+impl MapOutput {
+    /// Declares both topics.
+    ///
+    /// # Errors
+    /// What ROS refuses.
+    pub fn new(node: &mut Node) -> Result<Self> {
+        let cloud = "sensor_msgs/msg/PointCloud2";
+        Ok(Self {
+            whole: Topic::new(node, "~/output/map", cloud, Qos::Latched)?,
+            update: Topic::new(node, "~/output/map_update", cloud, Qos::Reliable)?,
+            last: None,
+            whole_sent: None,
+            whole_listeners: 0,
+            update_listeners: 0,
+            seen: 0,
+            pending: BTreeSet::new(),
+            known: BTreeSet::new(),
+        })
+    }
+
+    /// Another map took the place of the one so far: all of it is news, and what was sent of the old one is gone.
+    pub fn forget(&mut self) {
+        (self.seen, self.whole_sent) = (0, None);
+        self.pending.append(&mut self.known);
+    }
+
+    /// Sends what is due.
+    ///
+    /// # Errors
+    /// A tile that cannot be read back from disk, or what the middleware refuses.
+    pub fn offer(&mut self, map: &StaticMap, stamp_ns: i64, config: &LiveConfig, counts: &mut Published) -> Result<()> {
+        if self.last.is_some_and(|last| last.elapsed().as_secs_f64() < config.map_every_sec) || map.revision() == 0 {
+            return Ok(());
+        }
+        if map.revision() < self.seen {
+            self.forget();
+        }
+        let (whole, update) = (self.whole.listeners(), self.update.listeners());
+        let joined = whole > self.whole_listeners || (update > self.update_listeners && whole > 0);
+        if update > self.update_listeners {
+            self.seen = 0;
+        }
+        (self.whole_listeners, self.update_listeners) = (whole, update);
+        if whole == 0 && update == 0 {
+            return Ok(());
+        }
+        self.last = Some(Instant::now());
+        let max_bytes = config.map_max_mb * f64::from(1 << 20);
+        let news =
+            self.whole_sent.is_none_or(|(at, revision)| at.elapsed() >= WHOLE_EVERY && revision != map.revision());
+        if whole > 0 && (joined || news) {
+            self.send_whole(map, stamp_ns, (max_bytes / WHOLE_BYTES as f64) as usize, counts)?;
+        }
+        if update > 0 {
+            self.send_changes(map, stamp_ns, (max_bytes / UPDATE_BYTES as f64) as usize, counts)?;
+        } else {
+            (self.pending.clear(), self.known.clear());
+        }
+        Ok(())
+    }
+
+    fn send_whole(&mut self, map: &StaticMap, stamp_ns: i64, most: usize, counts: &mut Published) -> Result<()> {
+        let every = map.len().div_ceil(most.max(1)).max(1);
+        let cloud = thinned(map.cloud()?, every);
+        let cloud = cloud::MapCloud {
+            positions: &cloud.positions,
+            colors01: &cloud.colors01,
+            opacities: &cloud.opacities,
+            scales: &cloud.scales,
+            quats: &cloud.quats,
+        };
+        self.whole.send(encode_point_cloud2(&messages::map(stamp_ns, &cloud, counts)?))?;
+        self.whole_sent = Some((Instant::now(), map.revision()));
+        Ok(())
+    }
+
+    fn send_changes(&mut self, map: &StaticMap, stamp_ns: i64, most: usize, counts: &mut Published) -> Result<()> {
+        self.pending.extend(map.changed_tiles(self.seen));
+        self.seen = map.revision();
+        let (mut tiles, mut rows) = (Vec::new(), 0);
+        while let Some(tile) = self.pending.pop_first() {
+            let cloud = map.tile_cloud(&tile)?;
+            if rows > 0 && rows + cloud.len() > most {
+                self.pending.insert(tile);
+                break;
+            }
+            rows += cloud.len().max(1);
+            tiles.push((tile, cloud));
+        }
+        if tiles.is_empty() {
+            return Ok(());
+        }
+        self.known.extend(tiles.iter().filter(|(_, cloud)| !cloud.is_empty()).map(|(tile, _)| *tile));
+        let tile_m = map.config().tile_m;
+        let header = Header { stamp_ns, frame_id: ORIGIN_FRAME.into() };
+        let built = tile_cloud(header, &tiles, |tile| tile.map(|i| (f64::from(i) * tile_m) as f32))?;
+        counts.withheld += built.non_finite as u64;
+        self.update.send(encode_point_cloud2(&built.cloud))
+    }
+}
+
+/// Every `every`-th Gaussian.
+fn thinned(mut cloud: MapCloud, every: usize) -> MapCloud {
+    fn keep<T: Copy>(all: &mut Vec<T>, every: usize) {
+        *all = all.iter().step_by(every).copied().collect();
+    }
+    if every > 1 {
+        keep(&mut cloud.positions, every);
+        keep(&mut cloud.colors01, every);
+        keep(&mut cloud.opacities, every);
+        keep(&mut cloud.scales, every);
+        keep(&mut cloud.quats, every);
+        keep(&mut cloud.confidences, every);
+    }
+    cloud
+}

@@ -1,0 +1,177 @@
+//! Which topics of the running system play which part: the rules of a recording, on the graph as it is.
+
+use crate::bag::Topic;
+use crate::config::Config;
+use crate::source::topics::{PoseTopic, TopicPlan};
+
+use super::names::Names;
+
+/// Picture types.
+pub const IMAGE: &str = "sensor_msgs/msg/Image";
+const COMPRESSED: &str = "sensor_msgs/msg/CompressedImage";
+
+/// One camera's topics, by their final names.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LiveCamera {
+    /// Pictures.
+    pub image: String,
+    /// True for CompressedImage.
+    pub compressed: bool,
+    /// CameraInfo.
+    pub info: String,
+}
+
+/// Where the pose comes from.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LivePose {
+    /// A topic of a pose type.
+    Message {
+        /// Its name.
+        topic: String,
+        /// Its type.
+        type_name: String,
+    },
+    /// The transform tree.
+    Tf,
+}
+
+/// All inputs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LivePlan {
+    /// In the network's order.
+    pub cameras: Vec<LiveCamera>,
+    /// The vehicle pose.
+    pub pose: LivePose,
+}
+
+impl LivePlan {
+    /// From the topics that have a publisher. Second: whether the number of cameras was asked for, so that nothing more is
+    /// to be waited for.
+    ///
+    /// # Errors
+    /// What is not there yet, or ambiguous.
+    pub fn resolve(graph: &[Topic], names: &Names, config: &Config) -> Result<(Self, bool), String> {
+        let own = format!("{}/output/", names.node);
+        let transport = config.live.transport.as_str();
+        let has = |name: &str, kind: &str| graph.iter().any(|t| t.name == name && t.type_name == kind);
+        let graph: Vec<Topic> = graph
+            .iter()
+            .filter(|t| !t.name.starts_with(&own))
+            // Where a camera offers both, the one that is not wanted is not looked at.
+            .filter(|t| match (transport, t.type_name.as_str()) {
+                ("compressed", IMAGE) => !has(&format!("{}/compressed", t.name), COMPRESSED),
+                ("raw", COMPRESSED) => !t.name.strip_suffix("/compressed").is_some_and(|raw| has(raw, IMAGE)),
+                _ => true,
+            })
+            .cloned()
+            .collect();
+        let there = |name: &str| graph.iter().any(|t| t.name == name);
+        let mut input = config.input.clone();
+        for list in [&mut input.images, &mut input.camera_infos] {
+            list.iter_mut().for_each(|name| *name = names.resolve(name));
+        }
+        if !input.pose.is_empty() {
+            input.pose = names.resolve(&input.pose);
+        } else if there(&names.resolve("~/input/pose")) {
+            input.pose = names.resolve("~/input/pose");
+        }
+        let named = !input.images.is_empty();
+        if !named {
+            for i in 0.. {
+                let raw = names.resolve(&format!("~/input/camera{i}/image"));
+                let compressed = names.resolve(&format!("~/input/camera{i}/image/compressed"));
+                let Some(image) = [raw, compressed].into_iter().find(|name| there(name)) else { break };
+                input.images.push(image);
+                let info = names.resolve(&format!("~/input/camera{i}/camera_info"));
+                if input.camera_infos.len() == i && there(&info) {
+                    input.camera_infos.push(info);
+                }
+            }
+            // Some cameras with a CameraInfo of the standard name and some without: those are found beside the pictures.
+            if input.camera_infos.len() != input.images.len() {
+                input.camera_infos.clear();
+            }
+        }
+        let plan = TopicPlan::resolve(&graph, &input).map_err(|e| e.to_string())?;
+        let found = plan.cameras.len();
+        if config.live.cameras != 0 && config.live.cameras != found {
+            let names: Vec<&str> = plan.cameras.iter().map(|c| c.name.as_str()).collect();
+            return Err(format!("live.cameras = {}, but there are {found}: {}", config.live.cameras, names.join(", ")));
+        }
+        let name = |topic: usize| graph.get(topic).map(|t| t.name.clone()).unwrap_or_default();
+        let cameras = plan
+            .cameras
+            .iter()
+            .map(|c| LiveCamera { image: c.name.clone(), compressed: c.compressed, info: name(c.info) })
+            .collect();
+        let pose = match plan.pose {
+            PoseTopic::Tf => LivePose::Tf,
+            PoseTopic::Message(t) => LivePose::Message {
+                topic: name(t),
+                type_name: graph.get(t).map(|t| t.type_name.clone()).unwrap_or_default(),
+            },
+        };
+        Ok((Self { cameras, pose }, named || config.live.cameras != 0))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topic(name: &str, type_name: &str) -> Topic {
+        Topic { name: name.into(), type_name: type_name.into(), serialization: "cdr".into(), count: 1 }
+    }
+
+    fn graph() -> Vec<Topic> {
+        vec![
+            topic("/front/image_rect", IMAGE),
+            topic("/front/image_rect/compressed", COMPRESSED),
+            topic("/front/camera_info", "sensor_msgs/msg/CameraInfo"),
+            topic("/odom", "nav_msgs/msg/Odometry"),
+            topic("/storm/output/camera0/rendered", IMAGE),
+            topic("/storm/output/camera0/camera_info", "sensor_msgs/msg/CameraInfo"),
+        ]
+    }
+
+    fn resolve(graph: &[Topic], args: &str, set: &[&str]) -> Result<(LivePlan, bool), String> {
+        let names = Names::new("storm", "/", args.split_whitespace().map(str::to_owned));
+        let config = set.iter().fold(Config::default(), |c, s| c.with_override(s).unwrap());
+        LivePlan::resolve(graph, &names, &config)
+    }
+
+    #[test]
+    fn topics_are_found_by_type_and_own_outputs_are_no_inputs() {
+        let (plan, settled) = resolve(&graph(), "", &[]).unwrap();
+        assert_eq!((plan.cameras.len(), settled), (1, false));
+        assert_eq!((plan.cameras[0].image.as_str(), plan.cameras[0].compressed), ("/front/image_rect", false));
+        let (plan, settled) = resolve(&graph(), "", &["live.transport=compressed", "live.cameras=1"]).unwrap();
+        assert_eq!((plan.cameras[0].image.as_str(), settled), ("/front/image_rect/compressed", true));
+        let e = resolve(&graph(), "", &["live.cameras=2"]).unwrap_err();
+        assert!(e.contains("live.cameras = 2") && e.contains("/front/image_rect"), "{e}");
+    }
+
+    #[test]
+    fn standard_names_and_their_remaps_win() {
+        let remap = "--ros-args -r ~/input/camera0/image:=/front/image_rect -r ~/input/pose:=/odom";
+        let mut graph = graph();
+        graph.push(topic("/back/image_rect", IMAGE));
+        graph.push(topic("/back/camera_info", "sensor_msgs/msg/CameraInfo"));
+        graph.push(topic("/other", "nav_msgs/msg/Odometry"));
+        let (plan, _) = resolve(&graph, remap, &[]).unwrap();
+        assert_eq!(plan.cameras.len(), 1);
+        assert_eq!(plan.cameras[0].info, "/front/camera_info");
+        let odometry = LivePose::Message { topic: "/odom".into(), type_name: "nav_msgs/msg/Odometry".into() };
+        assert_eq!(plan.pose, odometry);
+        let e = resolve(&graph, "", &[]).unwrap_err();
+        assert!(e.contains("input.pose"), "{e}");
+    }
+
+    #[test]
+    fn what_is_not_there_is_named() {
+        let e = resolve(&graph()[2..], "", &[]).unwrap_err();
+        assert!(e.contains("camera image topic") && e.contains("/odom"), "{e}");
+        let e = resolve(&graph(), "", &["input.images=[/left]"]).unwrap_err();
+        assert!(e.contains("/left") && e.contains("input.images"), "{e}");
+    }
+}
