@@ -15,17 +15,24 @@ use storm_render::{Intrinsics, View};
 
 use super::{Outcome, UsageError, progress_bar};
 use crate::config::{Config, ModelConfigSection};
+use crate::dice::Dice;
 use crate::engine::score::{Scorer, Scores};
 use crate::engine::{Engine, ModelSource, views_of};
 use crate::overlap::Agreement;
-use crate::pipeline::step::{Step, newest_time_sec};
+use crate::pipeline::step::{Step, StepMaker, newest_time_sec};
 use crate::pipeline::timing::{StageStats, Timings, peak_rss_mb, reset_peak_rss};
+use crate::source::Frame;
 use crate::source::world::{first_window, posed_set, truth_images};
+use crate::window::Window;
 
 /// Drive whose pictures are used; held-out seeds start at 10,000.
 const BENCH_SEED: u64 = 424_242;
 /// Images drawn to time the drive.
 const WORLD_IMAGES: usize = 180;
+
+/// Steps of a vehicle that waits, and their distance.
+const SKIPPED_STEPS: i64 = 50;
+const SKIP_HOP_NS: i64 = 100_000_000;
 
 /// Held-out frames each network's scene is scored on.
 const SCORED_FRAMES: usize = 4;
@@ -86,7 +93,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         let section = ModelConfigSection { preset: model.clone(), ..ModelConfigSection::default() };
         let setting = time_network(model, &section, args.runs)?;
         println!(
-            "{:6} {:>6} tokens {:>7} Gaussians: step p50 {:>9.1} ms, p99 {:>9.1} ms, network {:>9.1} ms, three views {:>7.1} ms, peak {:.0} MB",
+            "{:6} {:>6} tokens {:>7} Gaussians: step p50 {:>9.1} ms, p99 {:>9.1} ms, network {:>9.1} ms, three views {:>7.1} ms, skipped {:>5.2} ms, peak {:.0} MB",
             setting.model,
             setting.tokens,
             setting.gaussians,
@@ -94,6 +101,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             setting.step_ms.p99,
             setting.stages_ms["network"].p50,
             setting.stages_ms["render"].p50,
+            setting.stages_ms.get("skipped step").map_or(f64::NAN, |s| s.p50),
             setting.peak_rss_mb.unwrap_or(0.0),
         );
         settings.push(setting);
@@ -176,19 +184,28 @@ pub(super) fn time_network(name: &str, section: &ModelConfigSection, runs: usize
             timings.merge(once);
         }
     }
-    let stages_ms = timings.stats();
     let peak_rss_mb = peak_rss_mb();
     let (scene, views) = last.context("no run")?;
     let gaussians = scene.gaussians.len();
     let agreement = Arc::new(Agreement::default());
-    let step = Step { index: 0, window, scene: Arc::new(scene), views: views.into(), agreement, total_ms: 0.0 };
+    let step = Step {
+        index: 0,
+        window: window.clone(),
+        scene: Arc::new(scene),
+        views: views.into(),
+        agreement,
+        total_ms: 0.0,
+    };
     let scores = score(engine.raster_settings(), step, &drive, &cameras)?;
+    let weights = engine.weights().to_string();
+    let skipped = if large { 0 } else { time_skipped(engine, window, cameras, &mut timings)? };
+    let stages_ms = timings.stats();
     Ok(Setting {
         model: name.into(),
-        weights: engine.weights().into(),
+        weights,
         dtype: "f32",
         skips: Vec::new(),
-        skipped: 0,
+        skipped,
         tokens,
         gaussians,
         picture: [width, height],
@@ -199,6 +216,34 @@ pub(super) fn time_network(name: &str, section: &ModelConfigSection, runs: usize
         depth_rmse: scores.as_ref().and_then(|s| s.storm.depth_rmse),
         epe3d: scores.as_ref().and_then(|s| s.storm.epe3d),
     })
+}
+
+/// Steps that see the window again, with other noise: the vehicle waits. How many of them were skipped.
+fn time_skipped(engine: Engine, window: Window<Frame>, cameras: Vec<Intrinsics>, timings: &mut Timings) -> Result<u64> {
+    let mut maker = StepMaker::new(engine, cameras, &Config::default(), None)?;
+    maker.run(window.clone())?;
+    let mut dice = Dice::new(BENCH_SEED);
+    for k in 1..=SKIPPED_STEPS {
+        let mut again = window.clone();
+        again.stamp_ns += k * SKIP_HOP_NS;
+        for set in &mut again.steps {
+            let mut one = (**set).clone();
+            one.stamp_ns += k * SKIP_HOP_NS;
+            for frame in &mut one.frames {
+                let mut rgb = (*frame.item.rgb).clone();
+                rgb.data.iter_mut().for_each(|x| *x = x.saturating_add(dice.below(3) as u8).saturating_sub(1));
+                frame.item = Frame { rgb: Arc::new(rgb) };
+            }
+            *set = Arc::new(one);
+        }
+        let before = maker.skips().still;
+        let start = Instant::now();
+        maker.run(again)?;
+        if maker.skips().still > before {
+            timings.add("skipped step", start.elapsed().as_secs_f64() * 1e3);
+        }
+    }
+    Ok(maker.skips().still)
 }
 
 /// The window's scene against the frames between its timesteps.
