@@ -38,10 +38,9 @@ fn parameters_become_the_configuration() {
     ]))
     .unwrap();
     assert_eq!((c.window.stride_sec, c.input.images.len(), c.input.base_from_camera.len()), (1.0, 1, 1));
-    for (name, value) in [
-        ("window.strid_sec", ParameterValue::Double(1.0)),
-        ("window.timesteps", ParameterValue::String("x".into())),
-    ] {
+    for (name, value) in
+        [("window.strid_sec", ParameterValue::Double(1.0)), ("window.timesteps", ParameterValue::String("x".into()))]
+    {
         assert!(read(&given(&[(name, value)])).unwrap_err().to_string().contains(name));
     }
 }
