@@ -101,7 +101,8 @@ impl MapOutput {
         if update > 0 {
             self.send_changes(map, stamp_ns, (max_bytes / UPDATE_BYTES as f64) as usize, counts)?;
         } else {
-            (self.pending.clear(), self.known.clear());
+            self.pending.clear();
+            self.known.clear();
         }
         Ok(())
     }

@@ -145,7 +145,8 @@ impl Stepper {
         }
         self.publish.add("publish", start.elapsed().as_secs_f64() * 1e3);
         // What has ended is of no use to anybody here; it would only fill memory.
-        (self.maker.ended_tracks(), self.maker.ended_objects());
+        drop(self.maker.ended_tracks());
+        drop(self.maker.ended_objects());
         Some(((self.clock)() - newest_ns) as f64 * 1e-6)
     }
 
