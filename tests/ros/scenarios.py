@@ -145,6 +145,12 @@ def same_as_replay(program, bag, work):
                 if m.topic == drive.images[-1]:
                     # Nor faster than the node: each set once the step before the last is there.
                     done += 1
+                    if done == 1:
+                        # Now there are publishers; whoever is to hear the first step has to be known to them.
+                        node.says("running:")
+                        until(lambda: all(peer.node.count_publishers(t) for t in topics), 20, "publishers of all outputs")
+                        time.sleep(1.0)
+                        start = time.monotonic() - (m.time_ns - drive.messages[0].time_ns) * 1e-9
                     due = [s for s in steps if s <= sets[max(done - 2, 0)]]
                     if due and done > 1:
                         until(lambda: peer.count("/storm/output/gaussians") >= len(due), 20, f"step {len(due)}")
@@ -157,7 +163,7 @@ def same_as_replay(program, bag, work):
             if (topic, steps[-2]) not in replayed:
                 continue
             live = peer.messages(topic, kind)
-            expect(len(live) >= len(steps) - 1, f"{topic}: {len(live)} messages for {len(steps)} steps")
+            expect(len(live) >= len(steps) - 2, f"{topic}: {len(live)} messages for {len(steps)} steps")
             for value in live:
                 inner = value.transforms[0] if topic == "/tf" else value
                 type_name, old = replayed[topic, stamp_of(inner.header)]
@@ -292,11 +298,11 @@ def clock_jump(program, bag, work):
             play(peer, drive)
             until(lambda: peer.count("/storm/output/gaussians") > 1, 20, "steps")
             time.sleep(1.0)
-            first = len(stamps(peer))
             play(peer, drive)
-            until(lambda: len(stamps(peer)) > first + 3, 20, "steps after the jump")
-            after = stamps(peer)[first:]
-            expect(after[0] < stamps(peer)[first - 1] and after == sorted(after), f"{after}")
+            # Steps of before may still come; then stamps go back, once.
+            back = lambda: [i for i, (a, b) in enumerate(zip(stamps(peer), stamps(peer)[1:])) if b < a]
+            until(lambda: back() and len(stamps(peer)) > back()[0] + 2, 20, "steps after the jump")
+            expect(len(back()) == 1, f"{stamps(peer)}")
             until(lambda: int(newest(peer)["pipeline"][2]["clock jumps and resets"]) == 1, 5, "one clock jump")
             expect(node.interrupt() == 0, node.log())
 

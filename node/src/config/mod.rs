@@ -258,8 +258,8 @@ section! {
         silence_sec: f64 = 1.0,
         /// Whether the node goes on with the cameras that are left when one stops.
         degrade: bool = true,
-        /// Whether the map is kept.
-        map: bool = true,
+        /// When the map is kept: `auto` (from when somebody first listens to it; always with a `map_dir`), `always`, `never`.
+        map: String = "auto".into(),
         /// Folder the map is kept and saved in; empty: it lives in memory alone.
         map_dir: String = String::new(),
         /// Least time between two messages of the map, seconds.

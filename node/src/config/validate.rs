@@ -70,6 +70,7 @@ impl Config {
         between("live.map_every_sec", self.live.map_every_sec, 0.05, 3600.0)?;
         between("live.map_max_mb", self.live.map_max_mb, 0.01, 1024.0)?;
         one_of("live.transport", &self.live.transport, &["auto", "raw", "compressed"])?;
+        one_of("live.map", &self.live.map, &["auto", "always", "never"])?;
         one_of("live.reliability", &self.live.reliability, &["sensor_data", "reliable"])?;
         one_of("input.rectified", &self.input.rectified, &["auto", "yes", "no"])?;
         one_of("model.device", &self.model.device, &["cpu", "cuda", "metal"])?;

@@ -35,6 +35,7 @@ pub struct MapOutput {
     pending: BTreeSet<TileIndex>,
     /// Tiles sent on `map_update`.
     known: BTreeSet<TileIndex>,
+    ever: bool,
 }
 
 impl MapOutput {
@@ -54,6 +55,7 @@ impl MapOutput {
             seen: 0,
             pending: BTreeSet::new(),
             known: BTreeSet::new(),
+            ever: false,
         })
     }
 
@@ -61,6 +63,12 @@ impl MapOutput {
     pub fn forget(&mut self) {
         (self.seen, self.whole_sent) = (0, None);
         self.pending.append(&mut self.known);
+    }
+
+    /// Whether anybody has ever listened to the map.
+    pub fn was_wanted(&mut self) -> bool {
+        self.ever = self.ever || self.whole.wanted() || self.update.wanted();
+        self.ever
     }
 
     /// Sends what is due.
@@ -93,7 +101,8 @@ impl MapOutput {
         if update > 0 {
             self.send_changes(map, stamp_ns, (max_bytes / UPDATE_BYTES as f64) as usize, counts)?;
         } else {
-            (self.pending.clear(), self.known.clear());
+            self.pending.clear();
+            self.known.clear();
         }
         Ok(())
     }

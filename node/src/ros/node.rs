@@ -395,7 +395,7 @@ impl Running {
             status: status.map(|now| (now, &self.status_before)),
             device: self.device.clone(),
             now_ns,
-            map: self.config.live.map,
+            map: self.config.live.map != "never",
         };
         if let Err(e) = self.diagnostics.send(encode_diagnostics(now_ns, &report.statuses())) {
             warn!("diagnostics could not be sent: {e:#}");

@@ -208,7 +208,11 @@ impl Outlet for Outputs {
             pictures: motion || any(&|c| c.rendered.wanted() || c.depth.wanted() || c.info.wanted()),
             tracks: self.tracks.wanted(),
             objects: self.objects.wanted() || self.detections.as_ref().is_some_and(Topic::wanted),
-            map: self.config.live.map,
+            map: match self.config.live.map.as_str() {
+                "always" => true,
+                "never" => false,
+                _ => self.map.was_wanted() || !self.config.live.map_dir.is_empty(),
+            },
         }
     }
 
@@ -240,9 +244,9 @@ impl Outlet for Outputs {
     }
 
     fn idle(&mut self, maker: &StepMaker) -> Result<()> {
-        match (self.config.live.map, self.stamp_ns) {
-            (true, Some(stamp_ns)) => self.map.offer(maker.map(), stamp_ns, &self.config.live, &mut self.counts),
-            _ => Ok(()),
+        match self.stamp_ns {
+            Some(stamp_ns) => self.map.offer(maker.map(), stamp_ns, &self.config.live, &mut self.counts),
+            None => Ok(()),
         }
     }
 

@@ -16,12 +16,15 @@ use crate::pipeline::live::{Command, Reply};
 /// Commands that came in and were not handed on yet.
 pub type Requests = Rc<RefCell<Vec<Command>>>;
 
+/// Makes the command that answers so.
+type MakeCommand = fn(Reply) -> Command;
+
 /// Offers the services; commands appear in `requests`.
 ///
 /// # Errors
 /// What ROS refuses.
 pub fn offer(node: &mut Node, spawner: &LocalSpawner, requests: &Requests) -> Result<()> {
-    let triggers: [(&'static str, fn(Reply) -> Command); 3] =
+    let triggers: [(&'static str, MakeCommand); 3] =
         [("reset", Command::Reset), ("save_map", Command::SaveMap), ("load_map", Command::LoadMap)];
     for (name, command) in triggers {
         let stream = node.create_service::<Trigger::Service>(&format!("~/{name}"), QosProfile::services_default())?;

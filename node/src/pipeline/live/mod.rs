@@ -9,9 +9,12 @@
 //! the newest window, so with a step longer than the input's period the hop grows and latency does not. Knows nothing of
 //! ROS; stages are those of a replay.
 
+mod decoder;
 mod inbox;
+mod map_folder;
 mod skew;
 mod status;
+mod stepper;
 #[cfg(test)]
 mod tests;
 mod watchdog;

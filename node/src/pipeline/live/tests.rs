@@ -251,9 +251,7 @@ fn a_clock_that_jumps_back_starts_anew_although_poses_come_after_their_images() 
 #[test]
 fn what_nobody_wants_is_not_drawn_and_commands_answer() {
     let nothing = Demand { motion: false, tracks: false, objects: false, map: false, pictures: false };
-    let mut c = config(1);
-    c.live.map = false;
-    let run = start(1, &c, Duration::ZERO, nothing).unwrap();
+    let run = start(1, &config(1), Duration::ZERO, nothing).unwrap();
     let asked = |make: &dyn Fn(Reply) -> Command| {
         let (tx, rx) = std::sync::mpsc::channel();
         run.live.command(make(Box::new(move |r| tx.send(r).unwrap())));

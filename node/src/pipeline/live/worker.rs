@@ -1,39 +1,35 @@
-//! The live pipeline's two threads.
+//! The running pipeline from outside: what it takes, what it is told, what it gives.
 
-use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use anyhow::{Context, Result, anyhow, bail};
-use crossbeam::channel::{Receiver, Sender, unbounded};
-use tracing::{info, warn};
+use anyhow::{Result, anyhow};
+use crossbeam::channel::{Sender, unbounded};
 
-use super::inbox::{Inbox, Taken};
+use super::decoder::Decoder;
+use super::inbox::Inbox;
+use super::map_folder::open_map;
 use super::skew::SkewGate;
 use super::status::Status;
-use crate::config::{Config, MapConfig};
+use super::stepper::{Own, Stepper};
+use crate::config::Config;
 use crate::engine::Engine;
-use crate::map::StaticMap;
-use crate::pipeline::front::{Front, FrontOutput};
+use crate::pipeline::front::Front;
 use crate::pipeline::posed::PoseStore;
 use crate::pipeline::saver::Saver;
 use crate::pipeline::step::{Demand, Step, StepMaker};
 use crate::pipeline::timing::Timings;
 use crate::rigid::Rigid;
-use crate::source::translate::{Role, translate};
-use crate::source::{Event, Rig};
-use crate::sync::DropReason;
+use crate::source::Rig;
+use crate::source::translate::Role;
 
 /// Poses and transforms that may wait; several seconds at 200 Hz.
 const MESSAGES_AHEAD: usize = 2048;
 /// The threads look for commands this often when nothing comes in.
-const PATIENCE: Duration = Duration::from_millis(20);
+pub(super) const PATIENCE: Duration = Duration::from_millis(20);
 /// Losses and failures that are written to the log one by one; the rest is only counted.
-const LOGGED: u64 = 5;
-/// Share of the newest value in a smoothed one.
-const SMOOTHING: f64 = 0.2;
+pub(super) const LOGGED: u64 = 5;
 
 /// One input, in the order of [`LiveOptions::inputs`].
 #[derive(Debug, Clone)]
@@ -128,7 +124,7 @@ pub struct Live {
     stepper: Option<JoinHandle<Result<()>>>,
 }
 
-fn lock(status: &Mutex<Status>) -> MutexGuard<'_, Status> {
+pub(super) fn lock(status: &Mutex<Status>) -> MutexGuard<'_, Status> {
     status.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -225,324 +221,5 @@ impl Live {
 impl Drop for Live {
     fn drop(&mut self) {
         self.messages.close();
-    }
-}
-
-/// The map a live run starts with. A folder that holds a map already is never emptied.
-fn open_map(config: &Config) -> Result<StaticMap> {
-    let (dir, load) = (Path::new(&config.live.map_dir), Path::new(&config.map.load));
-    let wanted = &config.map;
-    if dir.as_os_str().is_empty() {
-        if load.as_os_str().is_empty() {
-            return Ok(StaticMap::new(wanted));
-        }
-        bail!("map.load = {}: a live map to go on from needs live.map_dir, a folder to keep it in", load.display());
-    }
-    if load == dir {
-        return Ok(StaticMap::load(wanted, dir, false)?.0);
-    }
-    if StaticMap::open(dir, true).is_ok() {
-        let dir = dir.display();
-        bail!("live.map_dir = {dir} holds a saved map; set map.load={dir} to go on from it, or name another folder");
-    }
-    let (parent, made) = (dir.display(), || format!("live.map_dir = {}", dir.display()));
-    std::fs::create_dir_all(dir).with_context(|| format!("live.map_dir = {parent} cannot be made"))?;
-    if load.as_os_str().is_empty() {
-        return StaticMap::in_folder(wanted, dir).with_context(made);
-    }
-    StaticMap::copied(wanted, load, dir).with_context(made)
-}
-
-/// The map `map.load` names, read while the present one goes on; it replaces the files in `live.map_dir`.
-fn reload_map(wanted: &MapConfig, dir: &Path) -> Result<StaticMap> {
-    let load = PathBuf::from(&wanted.load);
-    if dir.as_os_str().is_empty() || load.as_os_str().is_empty() {
-        bail!("set map.load to the folder of a saved map, and live.map_dir to a folder to keep it in");
-    }
-    // Read once before anything is replaced.
-    let (map, _) = StaticMap::load(wanted, &load, false)?;
-    if load == dir {
-        return Ok(map);
-    }
-    drop(map);
-    Ok(StaticMap::copied(wanted, &load, dir)?)
-}
-
-struct Decoder {
-    messages: Arc<Inbox<Message>>,
-    events: Arc<Inbox<Event>>,
-    rig: Arc<Rig>,
-    inputs: Vec<LiveInput>,
-    ms: Arc<Mutex<f64>>,
-}
-
-impl Decoder {
-    fn run(self) {
-        let others = self.rig.cameras.len();
-        let mut losses = vec![0u64; self.inputs.len()];
-        loop {
-            let messages = match self.messages.take(1, PATIENCE) {
-                Taken::Some(messages) => messages,
-                Taken::Nothing => continue,
-                Taken::Closed => break,
-            };
-            for Message { input, data, received_ns } in messages {
-                let Some(LiveInput { topic, role }) = self.inputs.get(input) else { continue };
-                let start = Instant::now();
-                translate(&self.rig, role, topic, &data, received_ns, &mut |event| {
-                    let stream = match &event {
-                        Event::Image { camera, .. } => *camera,
-                        _ => others,
-                    };
-                    if let Event::Lost { detail, .. } = &event {
-                        losses[input] += 1;
-                        if losses[input] <= LOGGED {
-                            warn!("{detail}");
-                        }
-                    }
-                    self.events.push(stream, event);
-                });
-                if matches!(role, Role::Image { .. }) {
-                    let ms = start.elapsed().as_secs_f64() * 1e3;
-                    *self.ms.lock().unwrap_or_else(PoisonError::into_inner) = ms;
-                }
-            }
-        }
-        self.events.close();
-    }
-}
-
-/// Counts of the step thread itself.
-#[derive(Default)]
-struct Own {
-    sets: u64,
-    steps: u64,
-    failed_steps: u64,
-    failed_outputs: u64,
-    paused_images: u64,
-    paused: bool,
-    hop_sec: f64,
-    last: Option<(u32, i64)>,
-    gaussians: u64,
-}
-
-struct Stepper {
-    front: Front,
-    maker: StepMaker,
-    saver: Saver,
-    config: Config,
-    rig: Arc<Rig>,
-    messages: Arc<Inbox<Message>>,
-    is_image: Vec<bool>,
-    events: Arc<Inbox<Event>>,
-    to_do: Receiver<Command>,
-    status: Arc<Mutex<Status>>,
-    decode_ms: Arc<Mutex<f64>>,
-    outlet: Box<dyn Outlet>,
-    clock: Box<dyn Fn() -> i64 + Send>,
-    publish: Timings,
-    skew: SkewGate,
-    own: Own,
-}
-
-impl Stepper {
-    fn run(mut self) -> Result<()> {
-        let mut ready = VecDeque::new();
-        self.report(None);
-        loop {
-            let events = match self.events.take(usize::MAX, PATIENCE) {
-                Taken::Some(events) => events,
-                Taken::Nothing => Vec::new(),
-                Taken::Closed => break,
-            };
-            let commands: Vec<Command> = self.to_do.try_iter().collect();
-            let idle = events.is_empty() && commands.is_empty();
-            commands.into_iter().for_each(|c| self.obey(c));
-            for event in events {
-                self.take(event, &mut ready);
-            }
-            let latency_ms = if self.own.paused { None } else { self.step_newest() };
-            if let Err(e) = self.outlet.idle(&self.maker) {
-                self.output_failed(&format!("{e:#}"));
-            }
-            self.saver.offer(&mut self.maker);
-            if !idle {
-                self.report(latency_ms);
-            }
-        }
-        self.front.finish(&mut ready);
-        self.maker.save_map().context("the map could not be saved")?;
-        self.report(None);
-        Ok(())
-    }
-
-    fn take(&mut self, event: Event, ready: &mut VecDeque<FrontOutput>) {
-        if self.own.paused && matches!(event, Event::Image { .. }) {
-            self.own.paused_images += 1;
-            return;
-        }
-        let event = match event {
-            Event::Image { camera, stamp_ns, .. } if !self.skew.admits(camera, stamp_ns) => {
-                let detail = format!("camera {camera} at {stamp_ns} ns: far behind the other cameras");
-                Event::Lost { camera: Some(camera), reason: DropReason::Late, detail }
-            }
-            event => event,
-        };
-        self.front.take(event, ready);
-        for output in ready.drain(..) {
-            if let FrontOutput::Set(set) = output {
-                self.own.sets += 1;
-                if let Some(first) = set.frames.first() {
-                    self.outlet.vehicle(first.stamp_ns, self.front.base_pose(0, &first.map_from_camera));
-                }
-            }
-        }
-    }
-
-    /// Runs the newest window, if there is one; gives how old its newest image was when everything was sent.
-    fn step_newest(&mut self) -> Option<f64> {
-        let window = self.front.newest_window()?;
-        let demand = Demand { map: self.config.live.map, ..self.outlet.demand() };
-        let (epoch, stamp_ns) = (window.epoch, window.stamp_ns);
-        let newest_ns = window.steps.last().and_then(|s| s.frames.iter().map(|f| f.stamp_ns).max()).unwrap_or(stamp_ns);
-        if let Some((_, last_ns)) = self.own.last.filter(|(e, _)| *e == epoch) {
-            let hop_sec = (stamp_ns - last_ns) as f64 * 1e-9;
-            let share = if self.own.hop_sec > 0.0 { SMOOTHING } else { 1.0 };
-            self.own.hop_sec += share * (hop_sec - self.own.hop_sec);
-        }
-        self.own.last = Some((epoch, stamp_ns));
-        let step = match self.maker.run_for(window, demand) {
-            Ok(step) => step?,
-            Err(e) => {
-                self.own.failed_steps += 1;
-                if self.own.failed_steps <= LOGGED {
-                    warn!("step at {stamp_ns} ns failed: {e:#}");
-                }
-                return None;
-            }
-        };
-        self.own.steps += 1;
-        self.own.gaussians = step.scene.gaussians.len() as u64;
-        let start = Instant::now();
-        if let Err(e) = self.outlet.step(&step, &self.maker, self.front.active()) {
-            self.output_failed(&format!("step at {stamp_ns} ns: {e:#}"));
-        }
-        self.publish.add("publish", start.elapsed().as_secs_f64() * 1e3);
-        // What has ended is of no use to anybody here; it would only fill memory.
-        drop((self.maker.ended_tracks(), self.maker.ended_objects()));
-        Some(((self.clock)() - newest_ns) as f64 * 1e-6)
-    }
-
-    fn output_failed(&mut self, why: &str) {
-        self.own.failed_outputs += 1;
-        if self.own.failed_outputs <= LOGGED {
-            warn!("not everything could be published: {why}");
-        }
-    }
-
-    fn obey(&mut self, command: Command) {
-        match command {
-            Command::Reset(reply) => {
-                self.front.reset();
-                self.own.last = None;
-                reply(Ok("windows, poses and trajectories start anew; the map stays".into()));
-            }
-            Command::Pause(paused, reply) => {
-                self.own.paused = paused;
-                reply(Ok(if paused { "paused" } else { "running" }.into()));
-            }
-            Command::SaveMap(reply) => reply(match self.maker.map().folder().map(Path::to_path_buf) {
-                None => Err("the map has no folder; set live.map_dir".into()),
-                Some(dir) => match self.maker.save_map() {
-                    Ok(()) => Ok(format!("{} Gaussians in {}", self.maker.map().len(), dir.display())),
-                    Err(e) => Err(e.to_string()),
-                },
-            }),
-            Command::LoadMap(reply) => {
-                reply(match reload_map(&self.config.map, Path::new(&self.config.live.map_dir)) {
-                    Ok(map) => {
-                        let said = format!("{} Gaussians from {}", map.len(), self.config.map.load);
-                        self.maker.set_map(map);
-                        Ok(said)
-                    }
-                    Err(e) => Err(format!("{e:#}")),
-                })
-            }
-            Command::Cameras(active) => self.use_cameras(&active),
-            Command::Configure(config) => {
-                self.outlet.configure(&config);
-                self.front.set_hop(config.window.hop_sec);
-                self.config = *config;
-            }
-        }
-    }
-
-    fn use_cameras(&mut self, active: &[usize]) {
-        if active == self.front.active() || active.is_empty() {
-            return;
-        }
-        let store = PoseStore::nothing(&self.config.sync);
-        let front = std::mem::replace(&mut self.front, Front::on_demand(&self.config, &self.rig, store));
-        self.front = front.with_cameras(&self.config, &self.rig, active);
-        let all = self.rig.intrinsics();
-        self.maker.set_cameras(active.iter().filter_map(|&c| all.get(c).copied()).collect());
-        info!("going on with cameras {active:?}");
-    }
-
-    fn report(&mut self, latency_ms: Option<f64>) {
-        let mut drops = self.front.drops();
-        let (mut ring, mut messages_dropped) = (0, 0);
-        for (is_image, n) in self.is_image.iter().zip(self.messages.dropped()) {
-            *(if *is_image { &mut ring } else { &mut messages_dropped }) += n;
-        }
-        for (i, n) in self.events.dropped().into_iter().enumerate() {
-            *(if i < self.rig.cameras.len() { &mut ring } else { &mut messages_dropped }) += n;
-        }
-        drops.add(DropReason::Overflow, ring);
-        let mut stages_ms: Vec<(&'static str, f64)> = self.maker.timings().last().chain(self.publish.last()).collect();
-        stages_ms.push(("decode", *self.decode_ms.lock().unwrap_or_else(PoisonError::into_inner)));
-        if let Some(ms) = latency_ms {
-            stages_ms.push(("latency", ms));
-            self.outlet.times(&stages_ms);
-        }
-        let (own, map) = (&self.own, self.maker.map());
-        let mut status = lock(&self.status);
-        let mut latencies_ms = std::mem::take(&mut status.latencies_ms);
-        if status.paused != own.paused {
-            latencies_ms.clear();
-        }
-        *status = Status {
-            images_in: self.front.images_in() + ring + own.paused_images,
-            drops,
-            messages_dropped,
-            messages_lost: self.front.messages_lost(),
-            poses_rejected: self.front.poses_rejected(),
-            paused_images: own.paused_images,
-            sets: own.sets,
-            steps: own.steps,
-            superseded: self.front.superseded(),
-            windows: self.front.window_counts(),
-            non_finite_windows: self.maker.non_finite(),
-            skips: self.maker.skips(),
-            skip_level: self.maker.skip_level(),
-            failed_steps: own.failed_steps,
-            failed_outputs: own.failed_outputs,
-            hop_sec: own.hop_sec,
-            stamp_ns: own.last.map(|(_, stamp_ns)| stamp_ns),
-            stages_ms,
-            latencies_ms,
-            gaussians: own.gaussians,
-            map_gaussians: map.len() as u64,
-            map_mb: map.bytes() as f64 / f64::from(1 << 20),
-            map_evicted: map.counts().evicted,
-            tracks: self.maker.tracks().len() as u64,
-            objects: self.maker.objects().count() as u64,
-            epochs: self.front.epoch(),
-            active: self.front.active().to_vec(),
-            paused: own.paused,
-        };
-        if let Some(ms) = latency_ms {
-            status.latency(ms);
-        }
     }
 }
