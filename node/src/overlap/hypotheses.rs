@@ -152,12 +152,9 @@ fn see<'a>(scene: &Scene, pictures: &'a [Picture], p: Vec3) -> Option<Place<'a>>
     pictures.iter().find_map(|picture| {
         let c = picture.camera_from_anchor.transform_point3(p);
         let k = &picture.intrinsics;
-        if !(c.z > NEAR_M) {
-            return None;
-        }
         let (u, v) = (k.fx * c.x / c.z + k.cx, k.fy * c.y / c.z + k.cy);
         // With a neighbour on every side.
-        let inside = u >= 1.0 && v >= 1.0 && u < w - 1.0 && v < h - 1.0;
+        let inside = c.z > NEAR_M && u >= 1.0 && v >= 1.0 && u < w - 1.0 && v < h - 1.0;
         inside.then_some(Place { picture, u, v, z: c.z })
     })
 }

@@ -64,7 +64,7 @@ pub fn cpu_ms() -> Option<f64> {
     let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `time` is valid for the write, which is all that the call does.
     let failed = unsafe { libc::clock_gettime(libc::CLOCK_PROCESS_CPUTIME_ID, &raw mut time) };
-    (failed == 0).then(|| time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6)
+    (failed == 0).then_some(time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6)
 }
 
 /// Time all threads of this process have run; not known here.
