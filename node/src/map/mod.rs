@@ -243,12 +243,15 @@ impl StaticMap {
         let Some(store) = &mut self.store else {
             return Err(MapError::Damaged { path: "map".into(), reason: "this map was made without a folder".into() });
         };
-        for tile in &mut self.tiles {
-            tile.sweep();
-            if tile.cells.is_empty() {
+        for tile in &self.tiles {
+            if tile.len() == 0 {
                 store.discard(&tile.index);
-            } else {
-                store.put(tile)?;
+            } else if !store.is_current(tile) {
+                // A copy without its dead cells: when somebody saves must change nothing in the map, and where dead cells
+                // are taken out new ones are filed a little differently.
+                let mut copy = tile.clone();
+                copy.sweep();
+                store.put(&copy)?;
             }
         }
         store.commit(index)

@@ -16,6 +16,17 @@ const SPILLED_TO: f64 = 0.875;
 /// Windows between two attempts at a disk that refused.
 const RETRY_WINDOWS: u64 = 50;
 
+/// Hands memory that was freed back to the system. Tiles of all sizes come and go among what stays, and glibc keeps what
+/// they leave unless it is told: over a drive that spills, resident memory would go on growing though nothing more is in
+/// use.
+fn give_back() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: takes the allocator's own locks, and touches only pages that hold nothing.
+    unsafe {
+        libc::malloc_trim(0);
+    }
+}
+
 impl StaticMap {
     /// Brings the map within its caps.
     pub(super) fn make_room(&mut self, counts: &mut MapCounts) {
@@ -26,7 +37,11 @@ impl StaticMap {
         }
         if self.config.spill && self.store.is_some() && self.revision >= self.retry_spill_at {
             let part = |cap: usize| (cap as f64 * SPILLED_TO) as usize;
+            let before = counts.spilled;
             self.spill(gaussians.saturating_sub(part(most)), bytes.saturating_sub(part(most_bytes)), counts);
+            if counts.spilled > before {
+                give_back();
+            }
         }
         // Tiles shrink only once a good part of them is gone: a few rounds may be needed to free bytes.
         while self.loaded() > most || (self.bytes() > most_bytes && self.loaded() > 0) {

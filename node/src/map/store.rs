@@ -134,9 +134,14 @@ impl Store {
         self.saved.iter().map(|(index, s)| (*index, s.revision, s.cells))
     }
 
+    /// Whether this version of a tile is there.
+    pub fn is_current(&self, tile: &Tile) -> bool {
+        self.saved.get(&tile.index).is_some_and(|s| s.revision == tile.revision)
+    }
+
     /// Writes a tile unless this version is there already. On error nothing has changed.
     pub fn put(&mut self, tile: &Tile) -> Result<(), MapError> {
-        if self.saved.get(&tile.index).is_some_and(|s| s.revision == tile.revision) {
+        if self.is_current(tile) {
             return Ok(());
         }
         let (bytes, crc) = encode_tile(tile).map_err(MapError::io(&self.dir))?;

@@ -430,6 +430,32 @@ fn a_save_that_dies_leaves_the_last_one() {
     assert_eq!(StaticMap::load(&config, copy.path(), false).unwrap().0.cloud().unwrap(), saved);
 }
 
+/// Saves happen by the clock on the wall; two runs must still give the same map.
+#[test]
+fn saving_changes_nothing_in_the_map() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = |saved: bool| {
+        let mut map = StaticMap::in_folder(&MapConfig::default(), dir.path()).unwrap();
+        let mut dead = 0;
+        for step in 0..12 {
+            let mut r = Numbers(500 + step);
+            let noise: Vec<f32> = (0..2304).map(|_| 0.15 * (r.next() + r.next() + r.next() - 1.5)).collect();
+            // From far to near, so that cells are refined, joined and given up all the while.
+            let (g, k) = wall(48, 30.0 - 2.0 * step as f32, |i| noise[i]);
+            look(&mut map, 100 * step as i64, DVec3::new(2.0 * step as f64, 0.0, 0.0), &g, &k);
+            dead += map.tiles.iter().map(|t| t.cells.len() - t.len()).sum::<usize>();
+            if saved {
+                map.save().unwrap();
+            }
+        }
+        check(&map);
+        (map.cloud().unwrap(), map.counts(), dead)
+    };
+    let (never, always) = (run(false), run(true));
+    assert!(never.2 > 100, "there must have been dead cells: {}", never.2);
+    assert_eq!(never, always);
+}
+
 #[test]
 fn damage_is_refused_by_name_and_the_rest_loads() {
     let dir = tempfile::tempdir().unwrap();

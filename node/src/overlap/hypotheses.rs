@@ -43,34 +43,51 @@ pub(super) struct Gates {
     pub color_step: f32,
 }
 
-/// Pictures for and against a story.
-pub(super) type Looks = (u8, u8);
+/// What pictures say of a story.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Looks {
+    /// A surface of that colour is there.
+    pub there: u8,
+    /// They look through the place.
+    pub through: u8,
+    /// Something stands before it.
+    pub hidden: u8,
+}
+
+/// What one picture says of a place.
+enum Say {
+    There,
+    Through,
+    Hidden,
+}
 
 /// What the other pictures say of one Gaussian.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Verdict {
     /// The network says that it moves.
     pub claimed: bool,
-    /// For and against that it stands.
+    /// That it stands.
     pub still: Looks,
-    /// For and against that it moves as said; nothing where that was not claimed.
+    /// That it moves as said; nothing where that was not claimed.
     pub moves: Looks,
 }
 
 impl Verdict {
-    /// Found where it stood and not where it would have been.
+    /// Found where it stands, and not where it would have been.
     pub fn stands(&self) -> bool {
-        self.claimed && self.still.0 > 0 && self.still.1 == 0 && self.moves.0 == 0
+        self.claimed && self.still.there > 0 && self.still.through == 0 && self.moves.there == 0
     }
 
-    /// Looked through where it stands now, or found only where it would have been.
+    /// Looked through where it stands now, or found only where it would have been, while the place where it stands was
+    /// hidden (by itself, mostly: a car ahead).
     pub fn moves(&self) -> bool {
-        self.claimed && (self.still.1 > self.still.0 || (self.still.0 == 0 && self.moves.0 > 0))
+        let gone = self.still.there == 0 && self.still.hidden > 0 && self.moves.there > 0;
+        self.claimed && (self.still.through > self.still.there || gone)
     }
 
     /// Both stories are borne out: a surface that moves along itself, such as a bus's side, or the road.
     pub fn either(&self) -> bool {
-        self.claimed && !self.stands() && !self.moves() && self.still.0 > 0
+        self.claimed && self.still.there > 0 && !self.stands() && !self.moves()
     }
 }
 
@@ -108,10 +125,11 @@ pub(super) fn judge(scene: &Scene, pictures: &[Picture], gates: &Gates) -> Vec<V
                 let slack_m = gates.velocity_mps * dt_sec.abs();
                 for (place, slack_m, looks) in [(still, 0.0, &mut verdict.still), (moved, slack_m, &mut verdict.moves)]
                 {
-                    match place.map(|p| p.look(scene, color, slack_m, gates)) {
-                        Some(Some(true)) => looks.0 += 1,
-                        Some(Some(false)) => looks.1 += 1,
-                        _ => {}
+                    match place.and_then(|p| p.look(scene, color, slack_m, gates)) {
+                        Some(Say::There) => looks.there += 1,
+                        Some(Say::Through) => looks.through += 1,
+                        Some(Say::Hidden) => looks.hidden += 1,
+                        None => {}
                     }
                 }
             }
@@ -134,38 +152,56 @@ fn see<'a>(scene: &Scene, pictures: &'a [Picture], p: Vec3) -> Option<Place<'a>>
     pictures.iter().find_map(|picture| {
         let c = picture.camera_from_anchor.transform_point3(p);
         let k = &picture.intrinsics;
-        if c.z.is_nan() || c.z <= NEAR_M {
-            return None;
-        }
         let (u, v) = (k.fx * c.x / c.z + k.cx, k.fy * c.y / c.z + k.cy);
         // With a neighbour on every side.
-        let inside = u >= 1.0 && v >= 1.0 && u < w - 1.0 && v < h - 1.0;
+        let inside = c.z > NEAR_M && u >= 1.0 && v >= 1.0 && u < w - 1.0 && v < h - 1.0;
         inside.then_some(Place { picture, u, v, z: c.z })
     })
 }
 
 impl Place<'_> {
-    /// True: a surface of that colour is there. False: the picture looks through. None: no say.
-    fn look(&self, scene: &Scene, color: Vec3, slack_m: f32, gates: &Gates) -> Option<bool> {
+    /// None: no say.
+    fn look(&self, scene: &Scene, color: Vec3, slack_m: f32, gates: &Gates) -> Option<Say> {
         let width = scene.shape.width;
         let gate_m = gates.depth_part * self.z + GATE_M + slack_m;
         let (row, col) = (self.v as usize, self.u as usize);
-        let mut through = true;
+        let alike = |i: usize| {
+            let off = Vec3::from(scene.gaussians.colors[self.picture.first + i]) - color;
+            // Colours are -1 to 1: twice the step.
+            (off.length_squared() / 3.0).sqrt() <= 2.0 * gates.color_step
+        };
+        if (self.surface(width) - self.z).abs() <= gate_m && alike(row * width + col) {
+            return Some(Say::There);
+        }
+        let (mut through, mut hidden) = (true, true);
         for r in row - 1..=row + 1 {
             for c in col - 1..=col + 1 {
                 let i = r * width + c;
                 let depth = self.picture.depth[i];
-                if (depth - self.z).abs() <= gate_m {
-                    let off = Vec3::from(scene.gaussians.colors[self.picture.first + i]) - color;
-                    // Colours are -1 to 1: twice the step.
-                    if (off.length_squared() / 3.0).sqrt() <= 2.0 * gates.color_step {
-                        return Some(true);
-                    }
+                if (depth - self.z).abs() <= gate_m && alike(i) {
+                    return Some(Say::There);
                 }
-                // Phrased so that a pixel without a say (NaN) does not let anything through.
+                // Phrased so that a pixel without a say (NaN) is for neither.
                 through &= depth > self.z + gate_m;
+                hidden &= depth < self.z - gate_m;
             }
         }
-        through.then_some(false)
+        match (through, hidden) {
+            (true, _) => Some(Say::Through),
+            (_, true) => Some(Say::Hidden),
+            _ => None,
+        }
+    }
+
+    /// Depth of the surface between the four pixels around the place: over a plane the inverse of depth is linear in the
+    /// picture, and rows of a road are metres apart.
+    fn surface(&self, width: usize) -> f32 {
+        let (x, y) = (self.u - 0.5, self.v - 0.5);
+        let (a, b) = (x - x.floor(), y - y.floor());
+        let first = y as usize * width + x as usize;
+        let inverse = |i: usize| 1.0 / self.picture.depth[i];
+        let above = (1.0 - a) * inverse(first) + a * inverse(first + 1);
+        let below = (1.0 - a) * inverse(first + width) + a * inverse(first + width + 1);
+        1.0 / ((1.0 - b) * above + b * below)
     }
 }

@@ -139,7 +139,7 @@ impl Overlap {
             color_step: self.config.max_color_step as f32,
         };
         let verdicts = judge(scene, &now, &gates);
-        let stilled = vote::stilled(scene, &verdicts);
+        let stilled = vote::stilled(scene, &verdicts, &now);
         let agreement = self.agreement(&verdicts, &stilled, &differences, gate_part);
         self.take_away(scene, &stilled);
         agreement
@@ -213,8 +213,8 @@ impl Overlap {
                 };
                 let (near, off) = look(depth, gate_part);
                 let (same, other) = look(velocity, velocity_gate_mps);
-                let (agree, against) = if stilled || !verdict.claimed { verdict.still } else { verdict.moves };
-                let (agree, against) = (f32::from(agree), f32::from(against));
+                let looks = if stilled || !verdict.claimed { verdict.still } else { verdict.moves };
+                let (agree, against) = (f32::from(looks.there), f32::from(looks.through));
                 // What was said of a velocity that was taken away counts no more.
                 let (same, other) = if stilled { (0.0, 0.0) } else { (same, other) };
                 (share(near + agree, off + against), share(same + agree, other + against))

@@ -1,13 +1,16 @@
 //! Where the other pictures bear out both stories, neighbours and the motion group decide: a bus's side moves since its
-//! ends do, the road stands since its kerbs do.
+//! ends do. Where those say nothing it stands, as most surfaces do. Where the pictures bear out neither (the place has
+//! just come into view), neighbours alone may say that it stands.
 
 use rayon::prelude::*;
 use storm_model::scene::Scene;
 
-use super::hypotheses::Verdict;
+use super::hypotheses::{Picture, Verdict};
 
 /// Neighbours up to so many pixels away have a vote.
 const REACH: usize = 3;
+/// Neighbours whose depth differs by more than this part are of another surface.
+const SAME_SURFACE: f32 = 0.1;
 /// A motion group votes when at least this many of its Gaussians in the window are settled.
 const GROUP_LEAST: usize = 8;
 
@@ -15,36 +18,35 @@ const GROUP_LEAST: usize = 8;
 type Votes = (usize, usize);
 
 /// Per Gaussian, whether it is said to move and stands.
-pub(super) fn stilled(scene: &Scene, verdicts: &[Verdict]) -> Vec<bool> {
-    let shape = scene.shape;
-    let (w, h) = (shape.width, shape.height);
+pub(super) fn stilled(scene: &Scene, verdicts: &[Verdict], pictures: &[Picture]) -> Vec<bool> {
     let groups = groups(scene, verdicts);
-    let stands: Vec<bool> = (0..shape.timesteps * shape.cameras)
-        .into_par_iter()
-        .flat_map_iter(|k| {
-            let first = k * w * h;
-            let picture = &verdicts[first..first + w * h];
-            let around = Sums::new(picture, w, h);
+    let pixels = scene.shape.width * scene.shape.height;
+    pictures
+        .par_iter()
+        .flat_map_iter(|picture| {
+            let own = &verdicts[picture.first..picture.first + pixels];
             let groups = &groups;
-            (0..w * h).map(move |p| {
-                let verdict = &picture[p];
+            (0..pixels).map(move |p| {
+                let verdict = &own[p];
                 if !verdict.claimed || verdict.moves() {
                     return false;
                 }
                 if verdict.stands() {
                     return true;
                 }
-                let near = around.near(p / w, p % w);
-                let group = match near.0 == near.1 && verdict.either() && scene.gaussians.motion_count > 0 {
-                    true => groups.get(usize::from(scene.gaussians.motion_id(first + p))).copied().unwrap_or_default(),
-                    false => (0, 0),
+                let near = near(scene, own, picture, p);
+                if near.0 != near.1 || !verdict.either() {
+                    return near.0 > near.1;
+                }
+                let group = match scene.gaussians.motion_count {
+                    0 => None,
+                    _ => groups.get(usize::from(scene.gaussians.motion_id(picture.first + p))),
                 };
-                // Nobody near: of one who is not known at all the group says nothing.
-                near.0 > near.1 || (near.0 == near.1 && group.0 + group.1 >= GROUP_LEAST && group.0 > group.1)
+                let moves = |g: &Votes| g.0 + g.1 >= GROUP_LEAST && g.1 > g.0;
+                !group.is_some_and(moves)
             })
         })
-        .collect();
-    stands
+        .collect()
 }
 
 /// Settled votes of every motion group.
@@ -61,37 +63,19 @@ fn groups(scene: &Scene, verdicts: &[Verdict]) -> Vec<Votes> {
     votes
 }
 
-/// Sums over rectangles of a picture's settled votes.
-struct Sums {
-    width: usize,
-    height: usize,
-    /// `(height + 1) x (width + 1)`: votes above and left of a corner.
-    corners: Vec<[u32; 2]>,
-}
-
-impl Sums {
-    fn new(picture: &[Verdict], width: usize, height: usize) -> Self {
-        let stride = width + 1;
-        let mut corners = vec![[0; 2]; stride * (height + 1)];
-        for r in 0..height {
-            let mut row = [0; 2];
-            for c in 0..width {
-                let v = &picture[r * width + c];
-                row[0] += u32::from(v.stands());
-                row[1] += u32::from(v.moves());
-                let above = corners[r * stride + c + 1];
-                corners[(r + 1) * stride + c + 1] = [above[0] + row[0], above[1] + row[1]];
+/// Settled votes of the same surface around a pixel.
+fn near(scene: &Scene, verdicts: &[Verdict], picture: &Picture, p: usize) -> Votes {
+    let (w, h) = (scene.shape.width, scene.shape.height);
+    let (row, col, depth) = (p / w, p % w, picture.depth[p]);
+    let mut votes = (0, 0);
+    for r in row.saturating_sub(REACH)..(row + REACH + 1).min(h) {
+        for c in col.saturating_sub(REACH)..(col + REACH + 1).min(w) {
+            let i = r * w + c;
+            if (picture.depth[i] - depth).abs() <= SAME_SURFACE * depth {
+                votes.0 += usize::from(verdicts[i].stands());
+                votes.1 += usize::from(verdicts[i].moves());
             }
         }
-        Self { width, height, corners }
     }
-
-    fn near(&self, row: usize, col: usize) -> Votes {
-        let stride = self.width + 1;
-        let (r0, r1) = (row.saturating_sub(REACH), (row + REACH + 1).min(self.height));
-        let (c0, c1) = (col.saturating_sub(REACH), (col + REACH + 1).min(self.width));
-        let at = |r: usize, c: usize, k: usize| self.corners[r * stride + c][k];
-        let sum = |k: usize| (at(r1, c1, k) + at(r0, c0, k) - at(r0, c1, k) - at(r1, c0, k)) as usize;
-        (sum(0), sum(1))
-    }
+    votes
 }
