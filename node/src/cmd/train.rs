@@ -78,6 +78,10 @@ pub struct Args {
     /// How much more a moving pixel weighs in the flow term [default: 10].
     #[arg(long, allow_hyphen_values = true)]
     moving_weight: Option<f64>,
+    /// Weight of one term of the pixel stage, as `--pixel-weight opacity=0`; may be given again. To finish, leave opacity,
+    /// scale, color, depth and log_depth to the drawn pictures: they know better what several timesteps together look like.
+    #[arg(long, value_name = "TERM=WEIGHT", conflicts_with = "resume")]
+    pixel_weight: Vec<String>,
     /// Weight of the velocity regulariser [default: 0.005, the paper's].
     #[arg(long, allow_hyphen_values = true)]
     lambda_reg: Option<f64>,
@@ -242,6 +246,7 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         options.pixel.velocity = x;
         options.render.velocity = x;
     }
+    options.pixel = variants::set_keys("--pixel-weight", &options.pixel, &args.pixel_weight)?;
     args.variant.apply(&mut options);
     args.recorded.apply(&mut options)?;
     options.check().map_err(|e| UsageError(e.to_string()))?;

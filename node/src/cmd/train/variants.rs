@@ -4,6 +4,8 @@ use std::collections::BTreeSet;
 
 use anyhow::Result;
 use candle_core::Device;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use serde_json::Value;
 use storm_model::ModelConfig;
 use storm_model::train::TrainOptions;
@@ -53,7 +55,7 @@ pub struct Beginning {
 impl VariantArgs {
     /// The network's side.
     fn configure(&self, config: &ModelConfig) -> Result<ModelConfig> {
-        let mut config = set_keys(config, &self.network)?;
+        let mut config = set_keys("--network", config, &self.network)?;
         if let Some(m) = self.motion_tokens {
             config.num_motion_tokens = m;
         }
@@ -125,11 +127,11 @@ impl VariantArgs {
     }
 }
 
-/// A configuration with some of its keys set from `KEY=VALUE` texts, values in YAML.
-fn set_keys(config: &ModelConfig, changes: &[String]) -> Result<ModelConfig> {
-    let mut all = serde_json::to_value(config)?;
+/// Something with some of its keys set from `KEY=VALUE` texts, values in YAML; `option` is for messages.
+pub fn set_keys<T: Serialize + DeserializeOwned>(option: &str, of: &T, changes: &[String]) -> Result<T> {
+    let mut all = serde_json::to_value(of)?;
     for change in changes {
-        let wrong = |why: String| UsageError(format!("--network {change}: {why}"));
+        let wrong = |why: String| UsageError(format!("{option} {change}: {why}"));
         let (key, value) = change.split_once('=').ok_or_else(|| wrong("expected KEY=VALUE".into()))?;
         let value: Value = serde_yaml::from_str(value).map_err(|e| wrong(e.to_string()))?;
         let Some(place) = all.get_mut(key) else {
@@ -138,7 +140,7 @@ fn set_keys(config: &ModelConfig, changes: &[String]) -> Result<ModelConfig> {
         };
         *place = value;
         // One by one, so that the message is about this key.
-        serde_json::from_value::<ModelConfig>(all.clone()).map_err(|e| wrong(e.to_string()))?;
+        serde_json::from_value::<T>(all.clone()).map_err(|e| wrong(e.to_string()))?;
     }
     Ok(serde_json::from_value(all)?)
 }
@@ -203,7 +205,8 @@ mod tests {
     #[test]
     fn keys_of_the_network_are_set_by_name_and_wrong_ones_say_which_there_are() {
         let base = ModelConfig::preset("tiny").unwrap();
-        let with = |changes: &[&str]| set_keys(&base, &changes.iter().map(|c| c.to_string()).collect::<Vec<_>>());
+        let with =
+            |changes: &[&str]| set_keys("--network", &base, &changes.iter().map(|c| c.to_string()).collect::<Vec<_>>());
         assert_eq!(with(&[]).unwrap(), base);
         let deep = with(&["depth=6", "color=absolute"]).unwrap();
         assert_eq!((deep.depth, deep.color), (6, storm_model::config::ColorBase::Absolute));
