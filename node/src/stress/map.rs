@@ -52,16 +52,7 @@ fn one_cell(looks: usize, origin: DVec3) -> Finding {
     let mut map = StaticMap::new(&config);
     let anchor = Rigid::new(DQuat::IDENTITY, origin);
     for look in 0..looks {
-        let window = MapWindow {
-            stamp_ns: look as i64 * 100_000_000,
-            map_from_anchor: &anchor,
-            gaussians: &g,
-            eyes: &[],
-            pixels: 0,
-            first_new: 0,
-            views: &[],
-        };
-        map.fuse(&window, |_| Some(0.8), |_| [0.25, 0.5, 0.75]);
+        map.fuse(&look_at(&g, &anchor, look as i64 * 100_000_000), |_| Some(0.8), |_| [0.25, 0.5, 0.75]);
     }
     let Ok(cloud) = map.cloud() else {
         return Finding { worst_error: f64::INFINITY, ..Finding::default() };
@@ -82,6 +73,11 @@ fn one_cell(looks: usize, origin: DVec3) -> Finding {
     let color = cloud.colors01[0].iter().zip([0.25, 0.5, 0.75]).map(|(a, b)| f64::from((a - b as f32).abs()));
     finding.worst_error = color.fold(finding.worst_error, worst);
     finding
+}
+
+/// Gaussians offered from nowhere in particular.
+fn look_at<'a>(gaussians: &'a Gaussians, map_from_anchor: &'a Rigid, stamp_ns: i64) -> MapWindow<'a> {
+    MapWindow { stamp_ns, map_from_anchor, gaussians, eyes: &[], pixels: 0, first_new: 0, views: &[] }
 }
 
 fn push_plain(g: &mut Gaussians, scale: [f32; 3], opacity: f32) {
@@ -107,16 +103,7 @@ fn not_finite() -> Finding {
     push_plain(&mut g, [0.01; 3], 0.5);
     let mut map = StaticMap::new(&MapConfig::default());
     let anchor = Rigid::new(DQuat::IDENTITY, DVec3::ZERO);
-    let window = MapWindow {
-        stamp_ns: 0,
-        map_from_anchor: &anchor,
-        gaussians: &g,
-        eyes: &[],
-        pixels: 0,
-        first_new: 0,
-        views: &[],
-    };
-    map.fuse(&window, |_| Some(1.0), |_| [0.5; 3]);
+    map.fuse(&look_at(&g, &anchor, 0), |_| Some(1.0), |_| [0.5; 3]);
     match map.cloud() {
         Ok(cloud) => {
             let kept =
