@@ -8,6 +8,7 @@ use storm_node::config::Config;
 use storm_node::decode::RgbPicture;
 use storm_node::dice::Dice;
 use storm_node::engine::{Engine, ModelSource};
+use storm_node::pipeline::demand::Demand;
 use storm_node::pipeline::step::{Step, StepMaker};
 use storm_node::source::Frame;
 use storm_node::source::world::posed_set;
@@ -62,11 +63,22 @@ impl Standing {
 
     /// Steps of sets `0..n`; after each, its set's number, the step, and skips so far.
     fn run(&self, config: &Config, n: i64, paint: &dyn Fn(i64, &mut RgbPicture)) -> (StepMaker, Vec<(i64, Step, u64)>) {
+        self.run_for(config, n, paint, Demand::ALL)
+    }
+
+    /// The same, with no more than `demand`.
+    fn run_for(
+        &self,
+        config: &Config,
+        n: i64,
+        paint: &dyn Fn(i64, &mut RgbPicture),
+        demand: Demand,
+    ) -> (StepMaker, Vec<(i64, Step, u64)>) {
         let (mut maker, mut builder) = (self.maker(config), WindowBuilder::new(&config.window, 0));
         let mut steps = Vec::new();
         for k in 0..n {
             if let Some(window) = builder.push(self.set(k, paint)) {
-                let step = maker.run(window).unwrap().unwrap();
+                let step = maker.run_for(window, demand).unwrap().unwrap();
                 steps.push((k, step, maker.skips().still));
             }
         }
@@ -134,6 +146,26 @@ fn a_gate_that_lets_change_through_is_closed_by_the_contract() {
     let half = steps.len() / 2;
     let (early, late) = (steps[half].2, counts.still - steps[half].2);
     assert!(late <= early && (counts.still as usize) < steps.len() / 2, "{counts:?}: {early} then {late}");
+}
+
+#[test]
+fn the_contract_holds_without_pictures_too() {
+    let flow_alone = Demand { motion: false, tracks: false, objects: false, map: false, pictures: false };
+    let mut config = Config::default();
+    config.skip.check_every = 8;
+    let (maker, steps) = Standing::new().run_for(&config, 60, &nothing, flow_alone);
+    assert!(steps.iter().all(|(_, step, _)| step.views.is_empty()));
+    let counts = maker.skips();
+    assert!(counts.contract.checks >= 2 && counts.contract.broken == 0, "{counts:?}");
+    // A nearly blind gate, and cars that are there at one moment and not at the next: the flow tells.
+    (config.skip.still_levels, config.skip.still_sigmas) = (200.0, 100.0);
+    let shuffled = |k: i64, p: &mut RgbPicture| {
+        let width = 3 * p.width;
+        p.data.rotate_left(width * (k as usize * 7 % p.height));
+    };
+    let (maker, _) = Standing::new().run_for(&config, 60, &shuffled, flow_alone);
+    let counts = maker.skips();
+    assert!(counts.contract.checks >= 1 && counts.contract.broken >= 1, "{counts:?}");
 }
 
 #[test]

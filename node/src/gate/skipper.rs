@@ -2,12 +2,14 @@
 
 use std::sync::Arc;
 
+use glam::Vec3;
 use serde::Serialize;
 use storm_model::scene::{RenderedView, Scene};
 
 use crate::config::SkipConfig;
+use crate::engine::select;
 use crate::overlap::Agreement;
-use crate::pipeline::step::Demand;
+use crate::pipeline::demand::Demand;
 use crate::source::Frame;
 use crate::window::{PosedSet, Window};
 
@@ -21,6 +23,9 @@ const MOVING_MPS: f32 = 0.5;
 const SPEED_FLOOR_MPS: f64 = 0.05;
 /// Moving masks are compared over their union, and at least over this part of the pixels.
 const MASK_FLOOR: f64 = 0.01;
+
+/// Of results that cannot be compared.
+const UNLIKE: Difference = Difference { psnr_loss_db: f64::INFINITY, flow: f64::INFINITY, mask: 1.0 };
 
 /// What a step gives that can be taken again.
 #[derive(Clone)]
@@ -94,8 +99,12 @@ impl Skipper {
     /// A window was computed as planned. What comes after it is compared with it.
     pub fn computed(&mut self, now: &Computed, check: bool) {
         if let Some(last) = self.last.as_ref().filter(|_| check) {
-            let pictures = &now.window.steps[now.window.steps.len() - 1];
-            self.contract.checked(difference(pictures, &now.views, &last.views));
+            self.contract.checked(if now.views.is_empty() || last.views.is_empty() {
+                difference_undrawn(&now.scene, &last.scene)
+            } else {
+                let pictures = &now.window.steps[now.window.steps.len() - 1];
+                difference(pictures, &now.views, &last.views)
+            });
         }
         self.last = Some(now.clone());
     }
@@ -121,11 +130,10 @@ pub fn difference(pictures: &PosedSet<Frame>, full: &[RenderedView], skipped: &[
     let unlike = full.len() != skipped.len()
         || full.iter().zip(skipped).any(|(a, b)| (a.width, a.height) != (b.width, b.height));
     if unlike {
-        return Difference { psnr_loss_db: f64::INFINITY, flow: f64::INFINITY, mask: 1.0 };
+        return UNLIKE;
     }
     let (mut full_error, mut skipped_error, mut samples) = (0.0, 0.0, 0usize);
-    let (mut apart, mut speed, mut pixels) = (0.0, 0.0, 0usize);
-    let (mut differ, mut either) = (0usize, 0usize);
+    let mut flow = FlowGap::default();
     for (k, (a, b)) in full.iter().zip(skipped).enumerate() {
         if let Some(frame) = pictures.frames.get(k) {
             let truth = &frame.item.rgb.data;
@@ -136,25 +144,57 @@ pub fn difference(pictures: &PosedSet<Frame>, full: &[RenderedView], skipped: &[
             skipped_error += error(b);
             samples += truth.len();
         }
-        for (v, w) in a.flow.iter().flatten().zip(b.flow.iter().flatten()) {
-            let length = |v: [f32; 3]| (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
-            let (fast, slow) = (length(*v), length(*w));
-            apart += f64::from(length([v[0] - w[0], v[1] - w[1], v[2] - w[2]]));
-            speed += f64::from(fast);
-            pixels += 1;
-            let (one, other) = (fast > MOVING_MPS, slow > MOVING_MPS);
-            differ += usize::from(one != other);
-            either += usize::from(one || other);
-        }
+        a.flow.iter().flatten().zip(b.flow.iter().flatten()).for_each(|(v, w)| flow.add(*v, *w));
     }
     // The loss of PSNR is the ratio of the squared errors; pictures that are exact cannot be told apart below a level.
     let floor = samples.max(1) as f64 / 12.0;
     let psnr_loss_db = 10.0 * ((skipped_error + floor) / (full_error + floor)).log10();
-    let pixels = pixels.max(1) as f64;
-    Difference {
-        psnr_loss_db,
-        flow: apart / pixels / (speed / pixels).max(SPEED_FLOOR_MPS),
-        mask: differ as f64 / (either as f64).max(MASK_FLOOR * pixels),
+    Difference { psnr_loss_db, ..flow.difference() }
+}
+
+/// As [`difference`], where no pictures were asked for: of the newest pixels' own velocities, which are what is published.
+fn difference_undrawn(full: &Scene, skipped: &Scene) -> Difference {
+    if full.shape != skipped.shape {
+        return UNLIKE;
+    }
+    let mut flow = FlowGap::default();
+    for i in select::from_step(full, full.shape.timesteps - 1) {
+        if full.gaussians.opacities[i] >= select::SURFACE_OPACITY {
+            flow.add(full.gaussians.velocity_forward[i], skipped.gaussians.velocity_forward[i]);
+        }
+    }
+    flow.difference()
+}
+
+/// Sums over pixels of two flows.
+#[derive(Default)]
+struct FlowGap {
+    apart_mps: f64,
+    speed_mps: f64,
+    pixels: usize,
+    /// Pixels that move in one of the two, and in at least one.
+    differ: usize,
+    either: usize,
+}
+
+impl FlowGap {
+    fn add(&mut self, full: [f32; 3], skipped: [f32; 3]) {
+        let (v, w) = (Vec3::from(full), Vec3::from(skipped));
+        self.apart_mps += f64::from(v.distance(w));
+        self.speed_mps += f64::from(v.length());
+        self.pixels += 1;
+        let (one, other) = (v.length() > MOVING_MPS, w.length() > MOVING_MPS);
+        self.differ += usize::from(one != other);
+        self.either += usize::from(one || other);
+    }
+
+    fn difference(&self) -> Difference {
+        let pixels = self.pixels.max(1) as f64;
+        Difference {
+            psnr_loss_db: 0.0,
+            flow: self.apart_mps / pixels / (self.speed_mps / pixels).max(SPEED_FLOOR_MPS),
+            mask: self.differ as f64 / (self.either as f64).max(MASK_FLOOR * pixels),
+        }
     }
 }
 

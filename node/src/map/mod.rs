@@ -362,7 +362,15 @@ impl StaticMap {
     /// # Errors
     /// A tile on disk that cannot be read.
     pub fn cloud(&self) -> Result<MapCloud, MapError> {
-        let every = match self.config.max_written {
+        self.cloud_of(self.config.max_written)
+    }
+
+    /// The same with at most about `most` Gaussians; 0: all.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn cloud_of(&self, most: usize) -> Result<MapCloud, MapError> {
+        let every = match most {
             0 => 1,
             most => self.len().div_ceil(most).max(1),
         };

@@ -1,6 +1,7 @@
 //! The stages wired together: `front` (sync, poses, window), the engine, and what takes the results: files
 //! (`sink`, driven by `replay`) or whoever listens (`live`).
 
+pub mod demand;
 pub mod front;
 pub mod live;
 pub mod messages;

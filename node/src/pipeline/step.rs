@@ -21,6 +21,7 @@ use crate::source::Frame;
 use crate::tracks::{Track, TrackCounts, Tracker};
 use crate::window::Window;
 
+use super::demand::Demand;
 use super::timing::Timings;
 
 /// A surface the map has seen at one place for this long stands, whatever a network under fast ego motion says of its
@@ -51,32 +52,6 @@ pub struct StepResult {
     pub tracks: Vec<Track>,
     /// Moving objects that ended with it.
     pub objects: Vec<MovingObject>,
-}
-
-/// What somebody wants of a step; nothing else is worked out. The map and the Gaussians always are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Demand {
-    /// Motion groups in the pictures (the motion masks).
-    pub motion: bool,
-    /// Point trajectories.
-    pub tracks: bool,
-    /// Moving objects.
-    pub objects: bool,
-    /// The static map, and with it the pictures (the map is judged by them).
-    pub map: bool,
-    /// The pictures, although there is no map.
-    pub pictures: bool,
-}
-
-impl Demand {
-    /// Everything.
-    pub const ALL: Self = Self { motion: true, tracks: true, objects: true, map: true, pictures: true };
-
-    /// Whether what was worked out for this is enough for `other`.
-    pub fn covers(&self, other: Self) -> bool {
-        let pictures = self.pictures || self.map;
-        (self.motion || !other.motion) && (pictures || !other.pictures) && (self.map || !other.map)
-    }
 }
 
 /// Runs steps; owns the network, the map and the trackers.

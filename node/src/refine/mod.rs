@@ -16,7 +16,7 @@ use storm_model::metrics::Mean;
 use storm_model::metrics::image::{Image, psnr};
 use storm_model::scene::Affine;
 use storm_render::View;
-use storm_render::raster::{CpuRasterizer, RasterSettings, Splats};
+use storm_render::raster::{CpuRasterizer, RasterSettings};
 
 use crate::baselines::gs3d::{Params, Reference, Target, fit};
 use crate::engine::select::SURFACE_OPACITY;
@@ -78,14 +78,7 @@ struct Judged {
 fn draw(raster: &mut CpuRasterizer, params: &Params, view: View) -> Result<(Vec<f32>, Vec<f32>)> {
     let (mut scales, mut opacities) = (Vec::new(), Vec::new());
     params.activated(&mut scales, &mut opacities);
-    let splats = Splats {
-        means: &params.means,
-        quats: &params.quats,
-        scales: &scales,
-        opacities: &opacities,
-        features: bytemuck::cast_slice(&params.colors),
-        feature_count: 3,
-    };
+    let splats = params.splats(&scales, &opacities);
     let picture = raster.render(&splats, &[view])?.pop().context("the rasteriser gave no picture")?;
     Ok((picture.features.iter().map(|x| (0.5 * x + 0.5).clamp(0.0, 1.0)).collect(), picture.alpha))
 }

@@ -9,7 +9,7 @@ use r2r::Node;
 use super::publisher::Topic;
 use crate::cdr::encode::encode_point_cloud2;
 use crate::config::LiveConfig;
-use crate::map::{MapCloud, StaticMap, TileIndex};
+use crate::map::{StaticMap, TileIndex};
 use crate::msg::Header;
 use crate::output::cloud;
 use crate::output::cloud_live::tile_cloud;
@@ -108,8 +108,8 @@ impl MapOutput {
     }
 
     fn send_whole(&mut self, map: &StaticMap, stamp_ns: i64, most: usize, counts: &mut Published) -> Result<()> {
-        let every = map.len().div_ceil(most.max(1)).max(1);
-        let cloud = thinned(map.cloud()?, every);
+        let written = map.config().max_written;
+        let cloud = map.cloud_of(if written == 0 { most.max(1) } else { most.clamp(1, written) })?;
         let cloud = cloud::MapCloud {
             positions: &cloud.positions,
             colors01: &cloud.colors01,
@@ -145,20 +145,4 @@ impl MapOutput {
         counts.withheld += built.non_finite as u64;
         self.update.send(encode_point_cloud2(&built.cloud))
     }
-}
-
-/// Every `every`-th Gaussian.
-fn thinned(mut cloud: MapCloud, every: usize) -> MapCloud {
-    fn keep<T: Copy>(all: &mut Vec<T>, every: usize) {
-        *all = all.iter().step_by(every).copied().collect();
-    }
-    if every > 1 {
-        keep(&mut cloud.positions, every);
-        keep(&mut cloud.colors01, every);
-        keep(&mut cloud.opacities, every);
-        keep(&mut cloud.scales, every);
-        keep(&mut cloud.quats, every);
-        keep(&mut cloud.confidences, every);
-    }
-    cloud
 }

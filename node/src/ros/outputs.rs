@@ -17,9 +17,10 @@ use crate::config::Config;
 use crate::msg::Header;
 use crate::output::cloud_live::track_cloud;
 use crate::output::qos::Qos;
+use crate::pipeline::demand::Demand;
 use crate::pipeline::live::Outlet;
 use crate::pipeline::messages::{self, ORIGIN_FRAME, Pictures, Published};
-use crate::pipeline::step::{Demand, Step, StepMaker};
+use crate::pipeline::step::{Step, StepMaker};
 use crate::rigid::Rigid;
 use crate::source::Rig;
 

@@ -73,8 +73,7 @@ pub fn run(subject: &mut Subject, found: &mut dyn FnMut(Case)) -> Result<()> {
             subject.window(&spread, STRIDE_SEC).map_or_else(|e| refused(&e), |w| subject.compare(&w, &cameras));
         sheet.add(format!("timesteps {metres} m apart"), finding);
     }
-    let fovs: &[f32] = &[5.0, 30.0, 120.0, 170.0];
-    for &degrees in fovs {
+    for degrees in [5.0, 30.0, 120.0, 170.0] {
         let lens = |k: &Intrinsics| Intrinsics::from_fov(degrees, k.width, k.height);
         let lenses: Vec<Intrinsics> = cameras.iter().map(lens).collect();
         sheet.add(format!("field of view {degrees} degrees"), subject.compare(&window, &lenses));

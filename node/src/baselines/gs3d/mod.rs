@@ -12,7 +12,7 @@ use anyhow::{Result, ensure};
 use glam::Vec3;
 use storm_model::scene::Affine;
 use storm_render::View;
-use storm_render::raster::{CpuRasterizer, PictureGradient, RasterSettings, SplatGradients, Splats};
+use storm_render::raster::{CpuRasterizer, PictureGradient, RasterSettings, SplatGradients};
 
 pub use loss::Reference;
 pub use params::{Optimizer, Params, extent_m};
@@ -65,14 +65,7 @@ pub fn fit(
         }
         let Some(target) = stack.pop().and_then(|i| targets.get(i)) else { break };
         params.activated(&mut scales, &mut opacities);
-        let splats = Splats {
-            means: &params.means,
-            quats: &params.quats,
-            scales: &scales,
-            opacities: &opacities,
-            features: bytemuck::cast_slice(&params.colors),
-            feature_count: 3,
-        };
+        let splats = params.splats(&scales, &opacities);
         let views = [target.view];
         raster.render_into(&splats, &views, &mut pictures)?;
         let (loss, upstream) = target.loss(&pictures[0].features, &pictures[0].alpha);
@@ -139,14 +132,7 @@ mod tests {
         });
         let (mut scales, mut opacities) = (Vec::new(), Vec::new());
         p.activated(&mut scales, &mut opacities);
-        let splats = Splats {
-            means: &p.means,
-            quats: &p.quats,
-            scales: &scales,
-            opacities: &opacities,
-            features: bytemuck::cast_slice(&p.colors),
-            feature_count: 3,
-        };
+        let splats = p.splats(&scales, &opacities);
         let drawn = CpuRasterizer::new(RasterSettings::default()).unwrap().render(&splats, &views).unwrap();
         let rgb = drawn.iter().map(|d| d.features.iter().map(|x| 0.5 * x + 0.5).collect());
         (p.clone(), views.into_iter().zip(rgb).collect())

@@ -5,6 +5,7 @@ use std::num::NonZeroUsize;
 use glam::{Quat, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use storm_render::raster::SplatGradients;
+use storm_render::raster::Splats;
 use storm_render::{Gaussians, View};
 
 use crate::baselines::adam::Adam;
@@ -102,6 +103,18 @@ impl Params {
         scales.extend(self.log_scales.iter().map(|s| s.map(f32::exp)));
         opacities.clear();
         opacities.extend(self.logits.iter().map(|&x| sigmoid(x)));
+    }
+
+    /// What the rasteriser draws; `scales` and `opacities` are those of [`Params::activated`].
+    pub fn splats<'a>(&'a self, scales: &'a [[f32; 3]], opacities: &'a [f32]) -> Splats<'a> {
+        Splats {
+            means: &self.means,
+            quats: &self.quats,
+            scales,
+            opacities,
+            features: bytemuck::cast_slice(&self.colors),
+            feature_count: 3,
+        }
     }
 
     /// Finished Gaussians that stand still, seen at time 0.

@@ -1,0 +1,141 @@
+//! The kernel against the definition in f64.
+
+use super::*;
+use crate::kernels::tests::{noise, worst_difference};
+
+/// For values up to 1: the weights' own rounding, and that of logits of a few units.
+const TOLERANCE: f64 = 2e-6;
+/// Logits of 1e4 carry a rounding of up to 1e-3 each, and weights follow it.
+const BIG_LOGITS_TOLERANCE: f64 = 2e-2;
+
+fn reference(qkv: &[f32], s: Shape) -> Vec<f64> {
+    let (d, width) = (s.head_dim, s.width());
+    let at = |b: usize, t: usize, part: usize, h: usize, c: usize| -> f64 {
+        qkv[(b * s.tokens + t) * 3 * width + part * width + h * d + c].into()
+    };
+    let mut out = vec![0f64; s.batch * s.tokens * width];
+    for b in 0..s.batch {
+        for h in 0..s.heads {
+            for t in 0..s.tokens {
+                let logits: Vec<f64> = (0..s.tokens)
+                    .map(|u| (0..d).map(|c| at(b, t, 0, h, c) * at(b, u, 1, h, c)).sum::<f64>() / (d as f64).sqrt())
+                    .collect();
+                let top = logits.iter().fold(f64::NEG_INFINITY, |a, &l| a.max(l));
+                let weights: Vec<f64> = logits.iter().map(|l| (l - top).exp()).collect();
+                let total: f64 = weights.iter().sum();
+                for c in 0..d {
+                    let sum: f64 = weights.iter().enumerate().map(|(u, w)| w * at(b, u, 2, h, c)).sum();
+                    out[(b * s.tokens + t) * width + h * d + c] = sum / total;
+                }
+            }
+        }
+    }
+    out
+}
+
+fn shapes() -> Vec<Shape> {
+    let list = [
+        (1, 1, 1, 1),
+        (1, 2, 3, 8),
+        (2, 20, 4, 16),
+        (1, 97, 1, 64),
+        (1, 255, 2, 24),
+        (1, 256, 1, 33),
+        (2, 259, 2, 7),
+        (1, 700, 1, 72),
+    ];
+    list.iter().map(|&(batch, tokens, heads, head_dim)| Shape { batch, tokens, heads, head_dim }).collect()
+}
+
+#[test]
+fn every_shape() {
+    for isa in Isa::tested() {
+        for (i, s) in shapes().into_iter().enumerate() {
+            let mut qkv = noise(i as u64, s.batch * s.tokens * 3 * s.width(), 1.0);
+            // Some structure, so that weights are not all alike.
+            qkv.iter_mut().step_by(7).for_each(|x| *x *= 3.0);
+            let mut out = vec![f32::NAN; s.batch * s.tokens * s.width()];
+            attention(isa, &qkv, s, &mut out);
+            let worst = worst_difference(&out, &reference(&qkv, s));
+            assert!(worst < TOLERANCE, "{isa:?} {s:?}: {worst:e}");
+        }
+    }
+}
+
+#[test]
+fn either_way_to_the_weights_in_used_memory() {
+    let s = Shape { batch: 1, tokens: 301, heads: 2, head_dim: 20 };
+    let row = 3 * s.width();
+    for isa in Isa::tested() {
+        // Each head's queries times this: lengths bound the logits of neither, one or both heads.
+        for (i, scales) in [[0.5, 0.5], [0.5, 30.0], [30.0, 30.0]].into_iter().enumerate() {
+            let mut qkv = noise(40 + i as u64, s.tokens * row, 1.0);
+            for (j, x) in qkv.iter_mut().enumerate().filter(|(j, _)| j % row < s.width()) {
+                *x *= scales[j % row / s.head_dim];
+            }
+            let mut out = vec![f32::NAN; s.tokens * s.width()];
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+            pool.install(|| {
+                PACKED.with_borrow_mut(|memory| memory.at_least(1 << 17).fill(f32::NAN));
+                SCRATCH.with_borrow_mut(|Scratch { queries, weights, sums, totals }| {
+                    for memory in [queries, weights, sums, totals] {
+                        memory.at_least(1 << 16).fill(f32::NAN);
+                    }
+                });
+                attention(isa, &qkv, s, &mut out);
+            });
+            let worst = worst_difference(&out, &reference(&qkv, s));
+            assert!(worst < 10.0 * TOLERANCE, "{isa:?} {scales:?}: {worst:e}");
+        }
+    }
+}
+
+#[test]
+fn logits_of_ten_thousand_stay_finite() {
+    let s = Shape { batch: 1, tokens: 300, heads: 2, head_dim: 16 };
+    let mut qkv = noise(5, s.tokens * 3 * s.width(), 1.0);
+    for row in qkv.chunks_exact_mut(3 * s.width()) {
+        row[..2 * s.width()].iter_mut().for_each(|x| *x *= 100.0);
+    }
+    for isa in Isa::tested() {
+        let mut out = vec![f32::NAN; s.tokens * s.width()];
+        attention(isa, &qkv, s, &mut out);
+        assert!(out.iter().all(|x| x.is_finite() && x.abs() <= 1.0001));
+        let worst = worst_difference(&out, &reference(&qkv, s));
+        assert!(worst < BIG_LOGITS_TOLERANCE, "{isa:?}: {worst:e}");
+    }
+}
+
+#[test]
+fn nan_reaches_its_outputs_only() {
+    let s = Shape { batch: 1, tokens: 40, heads: 2, head_dim: 8 };
+    let mut qkv = noise(6, s.tokens * 3 * s.width(), 1.0);
+    qkv[17 * 3 * s.width() + 3] = f32::NAN;
+    for isa in Isa::tested() {
+        let mut out = vec![0.0; s.tokens * s.width()];
+        attention(isa, &qkv, s, &mut out);
+        for (i, x) in out.iter().enumerate() {
+            assert_eq!(x.is_nan(), i / s.width() == 17 && i % s.width() < 8, "element {i}");
+        }
+        let mut poisoned = qkv.clone();
+        poisoned[20 * 3 * s.width() + s.width() + 9] = f32::NAN;
+        attention(isa, &poisoned, s, &mut out);
+        assert!(out.chunks_exact(s.width()).all(|row| row[8..].iter().all(|x| x.is_nan())), "a key reaches all rows");
+    }
+}
+
+#[test]
+fn same_bits_for_any_thread_count() {
+    let s = Shape { batch: 2, tokens: 333, heads: 3, head_dim: 20 };
+    let qkv = noise(7, s.batch * s.tokens * 3 * s.width(), 2.0);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let mut out = vec![0.0; s.batch * s.tokens * s.width()];
+        pool.install(|| attention(Isa::detect(), &qkv, s, &mut out));
+        out
+    };
+    let one = run(1);
+    for threads in [2, 3, 8] {
+        assert!(one.iter().zip(&run(threads)).all(|(a, b)| a.to_bits() == b.to_bits()), "{threads} threads");
+    }
+}
