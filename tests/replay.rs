@@ -6,6 +6,8 @@ mod common;
 use std::path::Path;
 
 use common::{code, metrics, replay, stderr, synth};
+use storm_node::bag::Bag;
+use storm_node::cdr;
 use storm_node::output::ply::read_ply;
 
 /// Positions relative to the first pose may differ by this between a drive at the origin and one at UTM size, metres.
@@ -44,6 +46,43 @@ fn a_drive_becomes_a_results_folder_and_twice_the_same_one() {
     for name in ["map.ply", "tracks.csv", "trajectory.tum", "outputs.mcap"] {
         assert!(bytes(&a, name) == bytes(&b, name), "{name} differs between two runs");
     }
+}
+
+/// Whoever replays `outputs.mcap` sees the map grow: the last of each tile's messages together are the map at the end.
+#[test]
+fn the_changed_tiles_in_outputs_mcap_add_up_to_the_map() {
+    let dir = tempfile::tempdir().unwrap();
+    let (bag, out) = (dir.path().join("bag"), dir.path().join("out"));
+    synth(&bag, 5, "2.6", &[]);
+    let output = replay(&bag, &out, &["--set", "output.map_every_sec=0.3", "--set", "output.map_max_mb=0.05"]);
+    assert_eq!(code(&output), 0, "{}", stderr(&output));
+    let file = Bag::open(&out.join("outputs.mcap")).unwrap();
+    let topic = file.topics().iter().position(|t| t.name == "/storm/output/map_update").unwrap();
+    let mut tiles = std::collections::BTreeMap::<[i32; 3], Vec<[f32; 3]>>::new();
+    let mut messages = 0;
+    for message in file.messages(&[topic]).unwrap() {
+        let cloud = cdr::point_cloud2(&message.unwrap().data).unwrap();
+        messages += 1;
+        let mut now = std::collections::BTreeMap::<[i32; 3], Vec<[f32; 3]>>::new();
+        for row in cloud.data.chunks_exact(cloud.point_step as usize) {
+            let word = |name: &str, k: usize| {
+                let at = cloud.fields.iter().find(|f| f.name == name).unwrap().offset as usize + 4 * k;
+                <[u8; 4]>::try_from(&row[at..at + 4]).unwrap()
+            };
+            let tile = now.entry([0, 1, 2].map(|k| i32::from_le_bytes(word("tile_x", k)))).or_default();
+            if f32::from_le_bytes(word("opacity", 0)) > 0.0 {
+                tile.push([0, 1, 2].map(|k| f32::from_le_bytes(word("x", k))));
+            }
+        }
+        tiles.extend(now);
+    }
+    assert!(messages > 4, "{messages} messages");
+    let mut told: Vec<_> = tiles.into_values().flatten().map(|p| p.map(f32::to_bits)).collect();
+    let map = read_ply(&out.join("map.ply")).unwrap();
+    let mut whole: Vec<_> = map.cloud.positions.iter().map(|p| p.map(f32::to_bits)).collect();
+    told.sort_unstable();
+    whole.sort_unstable();
+    assert!(!whole.is_empty() && told == whole, "{} told, {} in the map", told.len(), whole.len());
 }
 
 #[test]

@@ -234,6 +234,10 @@ section! {
         min_opacity: f64 = 0.00392156862745098,
         /// Most Gaussians in one published cloud; the least opaque are left out and counted. 0: no limit.
         max_gaussians: usize = 0,
+        /// Least time between two messages of changed map tiles in outputs.mcap, seconds; 0: only the whole map at the end.
+        map_every_sec: f64 = 1.0,
+        /// Most in one of them, MiB; what is left waits for the next.
+        map_max_mb: f64 = 8.0,
         /// Steps shown in report.html, evenly spread.
         report_steps: usize = 8,
         /// Render frames that are not context at their own time and pose and score them.

@@ -63,6 +63,8 @@ impl Config {
         count("objects.confirm_steps", self.objects.confirm_steps, 1, 1_000_000)?;
         count("objects.max_objects", self.objects.max_objects, 1, 1_000_000)?;
         between("output.min_opacity", self.output.min_opacity, 0.0, 1.0)?;
+        between("output.map_every_sec", self.output.map_every_sec, 0.0, 3600.0)?;
+        between("output.map_max_mb", self.output.map_max_mb, 0.01, 1024.0)?;
         count("output.report_steps", self.output.report_steps, 0, 1000)?;
         count("live.cameras", self.live.cameras, 0, crate::source::topics::MAX_CAMERAS)?;
         count("live.queue", self.live.queue, 1, 1000)?;

@@ -10,6 +10,9 @@ use super::cloud::{BuiltCloud, GEOMETRY, Layout, UINT16, UINT32, finite, pack_rg
 use crate::map::{MapCloud, TileIndex};
 use crate::msg::Header;
 
+/// Bytes of a point in the topic of changed tiles.
+pub const TILE_POINT_BYTES: usize = 60;
+
 /// ROS data type code of int32.
 const INT32: u8 = 5;
 

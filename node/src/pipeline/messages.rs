@@ -6,12 +6,13 @@ use storm_model::scene::{Affine, RenderedView};
 
 use crate::config::Config;
 use crate::engine::select;
-use crate::map::color01;
+use crate::map::{TileIndex, color01};
 use crate::msg::{CameraInfo, Header, Image, Path, PointCloud2, PoseStamped, TransformStamped};
 use crate::output::OutputError;
 use crate::output::cloud::{
     BuiltCloud, FlowCloud, GaussianCloud, MapCloud, NO_TRACK, flow_cloud, gaussian_cloud, map_cloud, non_finite_values,
 };
+use crate::output::cloud_live::tile_cloud;
 use crate::output::picture::{Picture, mask_overlay};
 use crate::rigid::Rigid;
 use crate::source::rig::RigCamera;
@@ -163,6 +164,18 @@ impl<'a> Pictures<'a> {
 /// Map Gaussians, frame [`ORIGIN_FRAME`].
 pub fn map(stamp_ns: i64, cloud: &MapCloud, counts: &mut Published) -> Result<PointCloud2, OutputError> {
     Ok(counts.counted(map_cloud(Header { stamp_ns, frame_id: ORIGIN_FRAME.into() }, cloud)?))
+}
+
+/// Changed tiles of the map, frame [`ORIGIN_FRAME`]: each is here whole and replaces what was known of it.
+pub fn map_update(
+    stamp_ns: i64,
+    tile_m: f64,
+    tiles: &[(TileIndex, crate::map::MapCloud)],
+    counts: &mut Published,
+) -> Result<PointCloud2, OutputError> {
+    let header = Header { stamp_ns, frame_id: ORIGIN_FRAME.into() };
+    let corner = |tile: &TileIndex| tile.map(|i| (f64::from(i) * tile_m) as f32);
+    Ok(counts.counted(tile_cloud(header, tiles, corner)?))
 }
 
 /// The vehicle's poses so far, stamped with the last one.

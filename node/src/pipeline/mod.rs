@@ -4,6 +4,7 @@
 pub mod demand;
 pub mod front;
 pub mod live;
+pub mod map_updates;
 pub mod messages;
 pub mod metrics;
 pub mod posed;

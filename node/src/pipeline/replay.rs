@@ -19,6 +19,7 @@ use crate::source::topics::PoseTopic;
 use crate::source::{Event, Rig};
 
 use super::front::{Front, FrontOutput};
+use super::map_updates::MapUpdates;
 use super::metrics::{Counts, Metrics};
 use super::posed::PoseStore;
 use super::saver::Saver;
@@ -158,19 +159,26 @@ fn step_all(
     let mut front = Front::new(config, rig, store);
     let mut maker = StepMaker::new(engine, rig.intrinsics(), config, Some(&options.out.join(MAP_FOLDER)))?;
     let mut saver = Saver::new(config.map.save_every_sec);
+    let every_sec = if config.output.bag { config.output.map_every_sec } else { 0.0 };
+    let mut updates = MapUpdates::new(every_sec, config.output.map_max_mb);
     let batch = options.batch.max(1);
     let mut ready = VecDeque::new();
     for event in events {
         front.take(event, &mut ready);
         let windows = ready.iter().filter(|o| matches!(o, FrontOutput::Window(_))).count();
         // What came after a window that waits for others waits with it, so that the order of results stays the same.
-        if (windows == 0 || windows >= batch) && !hand_on(&mut ready, &front, &mut maker, to_sink)? {
+        if (windows == 0 || windows >= batch) && !hand_on(&mut ready, &front, &mut maker, &mut updates, to_sink)? {
             break;
         }
         saver.offer(&mut maker);
     }
     front.finish(&mut ready);
-    hand_on(&mut ready, &front, &mut maker, to_sink)?;
+    hand_on(&mut ready, &front, &mut maker, &mut updates, to_sink)?;
+    while let Some(update) = updates.rest(maker.map())? {
+        if to_sink.send(SinkInput::Map(update)).is_err() {
+            break;
+        }
+    }
     saver.save(&mut maker);
     Ok((front, Finished { map_saves_failed: saver.failed(), batch, ..maker.finish() }))
 }
@@ -180,6 +188,7 @@ fn hand_on(
     ready: &mut VecDeque<FrontOutput>,
     front: &Front,
     maker: &mut StepMaker,
+    updates: &mut MapUpdates,
     to_sink: &Sender<SinkInput>,
 ) -> Result<bool> {
     let (mut windows, mut rest) = (Vec::new(), Vec::with_capacity(ready.len()));
@@ -192,6 +201,7 @@ fn hand_on(
             other => rest.push(Some(other)),
         }
     }
+    let newest_ns = windows.last().map(|w| w.stamp_ns);
     let mut results = maker.run_all(windows)?.into_iter();
     let send = |input: SinkInput| to_sink.send(input).is_ok();
     for output in rest {
@@ -212,6 +222,11 @@ fn hand_on(
         if !sent {
             return Ok(false);
         }
+    }
+    if let Some(stamp_ns) = newest_ns
+        && let Some(update) = updates.offer(maker.map(), stamp_ns)?
+    {
+        return Ok(send(SinkInput::Map(update)));
     }
     Ok(true)
 }

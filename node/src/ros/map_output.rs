@@ -1,6 +1,5 @@
 //! The map topics: `map` holds the whole map for whoever joins, `map_update` the tiles that changed.
 
-use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -9,18 +8,16 @@ use r2r::Node;
 use super::publisher::Topic;
 use crate::cdr::encode::encode_point_cloud2;
 use crate::config::LiveConfig;
-use crate::map::{StaticMap, TileIndex};
-use crate::msg::Header;
+use crate::map::{StaticMap, TileNews};
 use crate::output::cloud;
-use crate::output::cloud_live::tile_cloud;
+use crate::output::cloud_live::TILE_POINT_BYTES;
 use crate::output::qos::Qos;
-use crate::pipeline::messages::{self, ORIGIN_FRAME, Published};
+use crate::pipeline::messages::{self, Published};
 
 /// The whole map is sent again after so long to those who listen already; a new listener gets it at once.
 const WHOLE_EVERY: Duration = Duration::from_secs(10);
-/// Bytes of a Gaussian in `map` and in `map_update`.
+/// Bytes of a Gaussian in `map`.
 const WHOLE_BYTES: usize = 48;
-const UPDATE_BYTES: usize = 60;
 
 /// The topics and what was sent on them.
 pub struct MapOutput {
@@ -30,11 +27,7 @@ pub struct MapOutput {
     whole_sent: Option<(Instant, u64)>,
     whole_listeners: usize,
     update_listeners: usize,
-    /// Changes up to this revision are sent or in `pending`.
-    seen: u64,
-    pending: BTreeSet<TileIndex>,
-    /// Tiles sent on `map_update`.
-    known: BTreeSet<TileIndex>,
+    news: TileNews,
     ever: bool,
 }
 
@@ -52,17 +45,15 @@ impl MapOutput {
             whole_sent: None,
             whole_listeners: 0,
             update_listeners: 0,
-            seen: 0,
-            pending: BTreeSet::new(),
-            known: BTreeSet::new(),
+            news: TileNews::default(),
             ever: false,
         })
     }
 
     /// Another map took the place of the one so far: all of it is news, and what was sent of the old one is gone.
     pub fn forget(&mut self) {
-        (self.seen, self.whole_sent) = (0, None);
-        self.pending.append(&mut self.known);
+        self.whole_sent = None;
+        self.news.forget();
     }
 
     /// Whether anybody has ever listened to the map.
@@ -79,13 +70,10 @@ impl MapOutput {
         if self.last.is_some_and(|last| last.elapsed().as_secs_f64() < config.map_every_sec) || map.revision() == 0 {
             return Ok(());
         }
-        if map.revision() < self.seen {
-            self.forget();
-        }
         let (whole, update) = (self.whole.listeners(), self.update.listeners());
         let joined = whole > self.whole_listeners || (update > self.update_listeners && whole > 0);
         if update > self.update_listeners {
-            self.seen = 0;
+            self.news.start_over();
         }
         (self.whole_listeners, self.update_listeners) = (whole, update);
         if whole == 0 && update == 0 {
@@ -99,10 +87,9 @@ impl MapOutput {
             self.send_whole(map, stamp_ns, (max_bytes / WHOLE_BYTES as f64) as usize, counts)?;
         }
         if update > 0 {
-            self.send_changes(map, stamp_ns, (max_bytes / UPDATE_BYTES as f64) as usize, counts)?;
+            self.send_changes(map, stamp_ns, (max_bytes / TILE_POINT_BYTES as f64) as usize, counts)?;
         } else {
-            self.pending.clear();
-            self.known.clear();
+            self.news.clear();
         }
         Ok(())
     }
@@ -123,26 +110,11 @@ impl MapOutput {
     }
 
     fn send_changes(&mut self, map: &StaticMap, stamp_ns: i64, most: usize, counts: &mut Published) -> Result<()> {
-        self.pending.extend(map.changed_tiles(self.seen));
-        self.seen = map.revision();
-        let (mut tiles, mut rows) = (Vec::new(), 0);
-        while let Some(tile) = self.pending.pop_first() {
-            let cloud = map.tile_cloud(&tile)?;
-            if rows > 0 && rows + cloud.len() > most {
-                self.pending.insert(tile);
-                break;
-            }
-            rows += cloud.len().max(1);
-            tiles.push((tile, cloud));
-        }
+        let tiles = self.news.take(map, most)?;
         if tiles.is_empty() {
             return Ok(());
         }
-        self.known.extend(tiles.iter().filter(|(_, cloud)| !cloud.is_empty()).map(|(tile, _)| *tile));
-        let tile_m = map.config().tile_m;
-        let header = Header { stamp_ns, frame_id: ORIGIN_FRAME.into() };
-        let built = tile_cloud(header, &tiles, |tile| tile.map(|i| (f64::from(i) * tile_m) as f32))?;
-        counts.withheld += built.non_finite as u64;
-        self.update.send(encode_point_cloud2(&built.cloud))
+        let message = messages::map_update(stamp_ns, map.config().tile_m, &tiles, counts)?;
+        self.update.send(encode_point_cloud2(&message))
     }
 }

@@ -173,6 +173,37 @@ fn only_what_changed_is_handed_out() {
 }
 
 #[test]
+fn whoever_takes_the_news_in_pieces_holds_the_map() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut map = StaticMap::in_folder(&MapConfig::default(), dir.path()).unwrap();
+    let mut news = TileNews::default();
+    let mut held = std::collections::BTreeMap::new();
+    let mut take = |news: &mut TileNews, map: &StaticMap, most: usize| {
+        let tiles = news.take(map, most).unwrap();
+        let rows: usize = tiles.iter().map(|(_, c)| c.len()).sum();
+        assert!(rows <= most || tiles.len() == 1, "{rows} in {} tiles, limit {most}", tiles.len());
+        let any = !tiles.is_empty();
+        held.extend(tiles);
+        held.retain(|_, c| !c.is_empty());
+        any
+    };
+    for from in [0, 4, 8, 12] {
+        drive(&mut map, from..from + 4);
+        take(&mut news, &map, 500);
+    }
+    assert!(take(&mut news, &map, 500), "a small limit leaves something for later");
+    while take(&mut news, &map, 500) {}
+    // Another map in its place: what the old one had elsewhere has to go.
+    let mut other = StaticMap::new(&MapConfig::default());
+    drive(&mut other, 3..5);
+    news.forget();
+    while take(&mut news, &other, 500) {}
+    let all: std::collections::BTreeMap<_, _> = other.changed_since(0).unwrap().into_iter().collect();
+    assert_eq!(held.keys().collect::<Vec<_>>(), all.keys().collect::<Vec<_>>());
+    assert!(held.values().zip(all.values()).all(|(a, b)| a.positions == b.positions && a.opacities == b.opacities));
+}
+
+#[test]
 fn a_late_loop_closure_moves_tiles_and_brings_two_passes_together() {
     let dir = tempfile::tempdir().unwrap();
     let mut map = StaticMap::in_folder(&MapConfig::default(), dir.path()).unwrap();

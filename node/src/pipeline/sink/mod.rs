@@ -26,6 +26,7 @@ use crate::tracks::Track;
 use crate::window::PosedSet;
 
 use super::front::TruthImage;
+use super::map_updates::MapUpdate;
 use super::messages::Published;
 use super::metrics::{Counts, Metrics};
 use super::step::{Finished, Step};
@@ -57,6 +58,8 @@ pub enum SinkInput {
     },
     /// A step's result.
     Step(Arc<Step>),
+    /// Changed tiles of the map.
+    Map(MapUpdate),
     /// Trajectories that have ended.
     Tracks(Vec<Track>),
     /// Moving objects that have ended.
@@ -127,6 +130,11 @@ impl Sink {
             SinkInput::Truth { camera, stamp_ns, kind, image } => {
                 if let Some(scorer) = &mut self.scorer {
                     scorer.truth(camera, stamp_ns, kind, image);
+                }
+            }
+            SinkInput::Map(update) => {
+                if let Some(publisher) = &mut self.publisher {
+                    self.timings.time("publish map", || publisher.map_update(&update, &self.config))?;
                 }
             }
             SinkInput::Objects(ended) => self.write_objects(&ended)?,

@@ -12,6 +12,7 @@ use crate::output::bag_writer::{BagWriter, TopicId};
 use crate::output::cloud::MapCloud;
 use crate::output::ply::PlyCloud;
 use crate::output::qos::Qos;
+use crate::pipeline::map_updates::MapUpdate;
 use crate::pipeline::messages::{self, Pictures, Published};
 use crate::pipeline::step::Step;
 use crate::rigid::Rigid;
@@ -34,10 +35,13 @@ pub struct Publisher {
     gaussians: TopicId,
     flow: TopicId,
     map: TopicId,
+    map_update: TopicId,
     path: TopicId,
     tf: TopicId,
     tf_static: TopicId,
     cameras: Vec<CameraTopics>,
+    /// The map's origin, as `/tf_static` has it.
+    origin_told: Option<DVec3>,
     counts: Published,
 }
 
@@ -49,6 +53,7 @@ impl Publisher {
         let gaussians = topic("gaussians", MessageType::PointCloud2, Qos::Reliable)?;
         let flow = topic("flow", MessageType::PointCloud2, Qos::Reliable)?;
         let map = topic("map", MessageType::PointCloud2, Qos::Latched)?;
+        let map_update = topic("map_update", MessageType::PointCloud2, Qos::Reliable)?;
         let path_topic = topic("trajectory", MessageType::Path, Qos::Reliable)?;
         let mut per_camera = Vec::with_capacity(cameras);
         for i in 0..cameras {
@@ -68,10 +73,12 @@ impl Publisher {
             gaussians,
             flow,
             map,
+            map_update,
             path: path_topic,
             tf,
             tf_static,
             cameras: per_camera,
+            origin_told: None,
             counts: Published::default(),
         })
     }
@@ -101,6 +108,24 @@ impl Publisher {
         Ok(())
     }
 
+    /// Writes changed tiles of the map.
+    pub fn map_update(&mut self, update: &MapUpdate, config: &Config) -> Result<()> {
+        self.tell_origin(update.stamp_ns, update.origin, config)?;
+        let cloud = messages::map_update(update.stamp_ns, update.tile_m, &update.tiles, &mut self.counts)?;
+        self.bag.write(self.map_update, update.stamp_ns, &encode::encode_point_cloud2(&cloud)?)?;
+        Ok(())
+    }
+
+    /// Says where the map's frame is, once.
+    fn tell_origin(&mut self, stamp_ns: i64, origin: DVec3, config: &Config) -> Result<()> {
+        if self.origin_told != Some(origin) {
+            let still = messages::origin_transform(&config.input.map_frame, stamp_ns, origin);
+            self.bag.write(self.tf_static, stamp_ns, &encode::encode_tf_message(&[still])?)?;
+            self.origin_told = Some(origin);
+        }
+        Ok(())
+    }
+
     /// Writes the map, its frame, and the trajectory, then the bag's index.
     pub fn finish(
         mut self,
@@ -110,8 +135,7 @@ impl Publisher {
         config: &Config,
     ) -> Result<Published> {
         let stamp_ns = poses.last().map_or(0, |(stamp, _)| *stamp);
-        let still = messages::origin_transform(&config.input.map_frame, stamp_ns, origin);
-        self.bag.write(self.tf_static, stamp_ns, &encode::encode_tf_message(&[still])?)?;
+        self.tell_origin(stamp_ns, origin, config)?;
         let cloud = MapCloud {
             positions: &map.positions,
             colors01: &map.colors01,
