@@ -7,7 +7,7 @@ use std::path::Path;
 
 use common::{code, metrics, replay, stderr, synth};
 use storm_node::bag::Bag;
-use storm_node::cdr;
+use storm_node::cdr::decode;
 use storm_node::output::ply::read_ply;
 
 /// Positions relative to the first pose may differ by this between a drive at the origin and one at UTM size, metres.
@@ -61,7 +61,7 @@ fn the_changed_tiles_in_outputs_mcap_add_up_to_the_map() {
     let mut tiles = std::collections::BTreeMap::<[i32; 3], Vec<[f32; 3]>>::new();
     let mut messages = 0;
     for message in file.messages(&[topic]).unwrap() {
-        let cloud = cdr::point_cloud2(&message.unwrap().data).unwrap();
+        let cloud = decode::point_cloud2(&message.unwrap().data).unwrap();
         messages += 1;
         let mut now = std::collections::BTreeMap::<[i32; 3], Vec<[f32; 3]>>::new();
         for row in cloud.data.chunks_exact(cloud.point_step as usize) {
