@@ -232,9 +232,12 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
     let mut track_judge = options.quality.then(|| TrackJudge::new(&drive));
     let cameras: Vec<_> = drive.cameras().iter().map(|c| c.intrinsics).collect();
     let sets = drive.frame_count();
-    let (mut times, mut recent) = (Vec::with_capacity(sets), std::collections::VecDeque::new());
-    let (mut live_tracks, mut gaussians) = (0, 0);
     let (all_steps, mut memory) = (sets.saturating_sub((config.window.timesteps - 1) * stride), Vec::new());
+    // Written to once, so that the measurements do not grow the memory they measure.
+    let mut times = vec![Times { rss_mb: 1.0, ..Times::default() }; all_steps];
+    times.clear();
+    let mut recent = std::collections::VecDeque::new();
+    let (mut live_tracks, mut gaussians) = (0, 0);
     // A held-out pose every two seconds: enough of them to judge, few enough to draw.
     let every = ((2.0 * options.drive.rate_hz) as usize).max(1);
     for frame in 0..sets {
@@ -308,7 +311,7 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
                     objects: mb(objects.bytes()),
                     overlap: mb(overlap.bytes()),
                     sets: mb(windows.bytes()),
-                    measurements: mb(times.len() * size_of::<Times>()),
+                    measurements: mb(times.capacity() * size_of::<Times>()),
                     ..Memory::default()
                 }
                 .of_process(),

@@ -47,8 +47,8 @@ impl LegContent {
     }
 }
 
-/// Most legs kept at once; a view needs five.
-const KEEP: usize = 24;
+/// Most legs kept at once; a view needs five, and cameras that look at other times a few more.
+const KEEP: usize = 8;
 
 /// The legs made so far. What a leg holds follows from the layout alone, so it makes no difference who made it when.
 #[derive(Debug, Default)]
@@ -62,14 +62,11 @@ impl LegStore {
         }
         let made = Arc::new(LegContent::new(layout, index));
         let mut legs = find();
-        if legs.len() >= KEEP {
-            // Keep the nearest half: a replay moves on along the route.
-            let mut far: Vec<usize> = legs.keys().copied().collect();
-            far.sort_by_key(|i| i.abs_diff(index));
-            far.drain(..KEEP / 2);
-            far.iter().for_each(|i| {
-                legs.remove(i);
-            });
+        // A replay moves on along the route: what lies farthest is not asked for again.
+        while legs.len() >= KEEP
+            && let Some(far) = legs.keys().copied().max_by_key(|i| i.abs_diff(index))
+        {
+            legs.remove(&far);
         }
         legs.entry(index).or_insert(made).clone()
     }
