@@ -93,7 +93,7 @@ fn standing_steps_are_skipped_restamped_and_checked() {
     let (maker, steps) = Standing::new().run(&Config::default(), 120, &nothing);
     let counts = maker.skips();
     assert!(counts.still as usize >= steps.len() * 8 / 10, "{counts:?} of {}", steps.len());
-    assert!(counts.contract.checks >= 1 && counts.contract.broken == 0, "{counts:?}");
+    assert!(counts.checks >= 1 && counts.broken == 0, "{counts:?}");
     for (i, (k, step, _)) in steps.iter().enumerate() {
         assert_eq!((step.index, step.window.stamp_ns), (i as u64, k * HOP_NS), "the heartbeat goes on");
     }
@@ -141,7 +141,7 @@ fn a_gate_that_lets_change_through_is_closed_by_the_contract() {
     };
     let (maker, steps) = Standing::new().run(&config, 100, &dawn);
     let counts = maker.skips();
-    assert!(counts.contract.broken >= 2, "{counts:?}");
+    assert!(counts.broken >= 2, "{counts:?}");
     // The level fell within one interval of checks, and stays low.
     let half = steps.len() / 2;
     let (early, late) = (steps[half].2, counts.still - steps[half].2);
@@ -156,7 +156,7 @@ fn the_contract_holds_without_pictures_too() {
     let (maker, steps) = Standing::new().run_for(&config, 60, &nothing, flow_alone);
     assert!(steps.iter().all(|(_, step, _)| step.views.is_empty()));
     let counts = maker.skips();
-    assert!(counts.contract.checks >= 2 && counts.contract.broken == 0, "{counts:?}");
+    assert!(counts.checks >= 2 && counts.broken == 0, "{counts:?}");
     // A nearly blind gate, and cars that are there at one moment and not at the next: the flow tells.
     (config.skip.still_levels, config.skip.still_sigmas) = (200.0, 100.0);
     let shuffled = |k: i64, p: &mut RgbPicture| {
@@ -165,7 +165,7 @@ fn the_contract_holds_without_pictures_too() {
     };
     let (maker, _) = Standing::new().run_for(&config, 60, &shuffled, flow_alone);
     let counts = maker.skips();
-    assert!(counts.contract.checks >= 1 && counts.contract.broken >= 1, "{counts:?}");
+    assert!(counts.checks >= 1 && counts.broken >= 1, "{counts:?}");
 }
 
 #[test]

@@ -114,9 +114,21 @@ section! {
         still_sigmas: f64 = 6.0,
         /// and by more than this many 8-bit levels.
         still_levels: f64 = 1.5,
-        /// After this many skipped steps one is computed all the same and compared; 0: nothing is skipped.
-        check_every: usize = 50,
-        /// Most PSNR a skipped step may lose against the computed one, dB; beyond it checks come twice as often, down to no skipping.
+        /// A window that the last computed Gaussians, moved by their velocities, explain in every patch of the newest pictures takes them, extrapolated.
+        predict: bool = true,
+        /// Farthest ahead of the last computed step, seconds.
+        predict_sec: f64 = 0.5,
+        /// Farthest a camera may have moved since, metres.
+        predict_m: f64 = 10.0,
+        /// And turned, degrees.
+        predict_deg: f64 = 10.0,
+        /// A patch is unexplained when picture less prediction has changed by more than noise, by more than this many 8-bit levels,
+        predict_levels: f64 = 4.0,
+        /// and by more than the picture changes within this many pixels.
+        predict_px: f64 = 0.5,
+        /// After this many skipped or approximated steps one is computed in full all the same and compared; 0: nothing is skipped.
+        check_every: usize = 100,
+        /// Most PSNR such a step may lose against the full one, dB; beyond it the level goes down a notch until a check holds again.
         max_psnr_loss_db: f64 = 0.1,
         /// Largest difference of velocities, as a part of the speeds seen.
         max_flow_change: f64 = 0.02,

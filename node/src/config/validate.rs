@@ -24,6 +24,11 @@ impl Config {
         between("skip.still_sec", self.skip.still_sec, 0.0, 1.0)?;
         between("skip.still_sigmas", self.skip.still_sigmas, 1.0, 100.0)?;
         between("skip.still_levels", self.skip.still_levels, 0.0, 255.0)?;
+        between("skip.predict_sec", self.skip.predict_sec, 0.0, 60.0)?;
+        between("skip.predict_m", self.skip.predict_m, 0.0, 1000.0)?;
+        between("skip.predict_deg", self.skip.predict_deg, 0.0, 180.0)?;
+        between("skip.predict_levels", self.skip.predict_levels, 0.0, 255.0)?;
+        between("skip.predict_px", self.skip.predict_px, 0.0, 10.0)?;
         count("skip.check_every", self.skip.check_every, 0, 1_000_000)?;
         between("skip.max_psnr_loss_db", self.skip.max_psnr_loss_db, 0.0, 100.0)?;
         between("skip.max_flow_change", self.skip.max_flow_change, 0.0, 100.0)?;

@@ -1,5 +1,6 @@
 //! One step: a window through the network, its pictures, and what it adds to the map and the trajectories.
 
+use std::collections::VecDeque;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -8,16 +9,19 @@ use anyhow::Result;
 use storm_model::ModelError;
 use storm_model::scene::{RenderedView, Scene, Want};
 use storm_render::Intrinsics;
-use tracing::warn;
+use tracing::{debug, warn};
 
 use crate::config::Config;
 use crate::engine::{Engine, select, views_of};
-use crate::gate::skipper::{Computed, Plan, SkipCounts, Skipper};
+use crate::gate::contract::{Notch, Verdict};
+use crate::gate::predict::{PixelFlow, explains, moved_on, pixel_flow};
+use crate::gate::skipper::{Computed, Plan, Shadow, SkipCounts, Skipper};
 use crate::map::{MapError, SceneLook, StaticMap};
 use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
 use crate::overlap::{Agreement, Overlap, OverlapCounts, OverlapLook};
 use crate::rigid::Rigid;
 use crate::source::Frame;
+use crate::sync::clock::seconds_between;
 use crate::tracks::{Track, TrackCounts, Tracker};
 use crate::window::Window;
 
@@ -27,6 +31,8 @@ use super::timing::Timings;
 /// A surface the map has seen at one place for this long stands, whatever a network under fast ego motion says of its
 /// speed: nothing that moves at a gate of 1 m/s stays in a voxel that long.
 const STANDS_SEC: f64 = 1.0;
+/// Stamps remembered of sets the map was given: those of a window's length at 100 Hz.
+const FUSED_KEPT: usize = 512;
 
 /// What one step gives.
 pub struct Step {
@@ -40,6 +46,11 @@ pub struct Step {
     pub views: Arc<[RenderedView]>,
     /// How far this window and earlier ones agree about its Gaussians.
     pub agreement: Arc<Agreement>,
+    /// The notch that took it, where it was not computed in full.
+    pub notch: Option<Notch>,
+    /// What the newest pictures' pixels show, where the newest timestep's Gaussians are not aligned with them: an extrapolated
+    /// step's belong to the pixels of the last computed one.
+    pub pixels: Option<PixelFlow>,
     /// Milliseconds from window to here.
     pub total_ms: f64,
 }
@@ -65,8 +76,17 @@ pub struct StepMaker {
     overlap: Overlap,
     skipper: Skipper,
     timings: Timings,
+    /// Stamps of sets the map was given at their newest; no more than a window holds.
+    fused: VecDeque<i64>,
     steps: u64,
     non_finite: u64,
+}
+
+/// A prediction of a window from the last computed one.
+struct Predicted {
+    /// The new window, in the computed one's anchor.
+    window: Window<Frame>,
+    views: Vec<RenderedView>,
 }
 
 impl StepMaker {
@@ -97,6 +117,7 @@ impl StepMaker {
             skipper: Skipper::new(&config.skip),
             config: config.clone(),
             timings: Timings::default(),
+            fused: VecDeque::new(),
             steps: 0,
             non_finite: 0,
         })
@@ -144,11 +165,6 @@ impl StepMaker {
         self.skipper.counts()
     }
 
-    /// Skips allowed between two checks at present; 0: none.
-    pub fn skip_level(&self) -> u64 {
-        self.skipper.level()
-    }
-
     /// The network, for what it says of itself.
     pub fn engine(&self) -> &Engine {
         &self.engine
@@ -159,17 +175,67 @@ impl StepMaker {
         self.run_for(window, Demand::ALL)
     }
 
-    /// The same, with no more than `demand` asks for. A window that shows what the last computed one showed takes its result
-    /// (see [`crate::gate`]).
+    /// The same, with no more than `demand` asks for. A window that shows what the last computed one showed takes its result, one
+    /// that it explains once moved on takes it extrapolated (see [`crate::gate`]).
     pub fn run_for(&mut self, window: Window<Frame>, demand: Demand) -> Result<Option<Step>> {
         let plan = self.timings.time("gate", || self.skipper.plan(&window, demand));
-        let check = match plan {
+        let shadow = match plan {
             Plan::Reuse(again) => return Ok(Some(self.again(window, again, demand))),
-            Plan::Compute { check } => check,
+            Plan::Predict(last) => match self.predict(&window, &last, demand) {
+                None => {
+                    self.skipper.unexplained();
+                    None
+                }
+                Some(predicted) => match self.skipper.explained() {
+                    Verdict::Skip => return Ok(Some(self.extrapolated(predicted, &last, demand))),
+                    Verdict::Check => Some(Shadow {
+                        notch: Notch::Predicted,
+                        approximate: last.approximate,
+                        scene: last.scene,
+                        views: predicted.views.into(),
+                        map_from_anchor: last.window.map_from_anchor.rotation,
+                    }),
+                    Verdict::Full => None,
+                },
+            },
+            Plan::Compute { shadow } => shadow,
         };
         let start = Instant::now();
         let scene = self.engine.step(&window, &self.cameras);
-        self.take_in(window, scene, start.elapsed().as_secs_f64() * 1e3, demand, check)
+        self.take_in(window, scene, start.elapsed().as_secs_f64() * 1e3, demand, shadow.as_ref())
+    }
+
+    /// The last computed step drawn at the window's newest time and poses, where that explains its pictures everywhere.
+    fn predict(&mut self, window: &Window<Frame>, last: &Computed, demand: Demand) -> Option<Predicted> {
+        let start = Instant::now();
+        let then = &last.window;
+        let first_ns = then.steps.first().map_or(then.stamp_ns, |s| s.stamp_ns);
+        let targets = views_of(&window.steps[window.steps.len() - 1], &then.map_from_anchor, &self.cameras);
+        let want = Want { flow: true, motion: demand.motion };
+        let time_sec = seconds_between(first_ns, window.stamp_ns) as f32;
+        let views = self.engine.render(&last.scene, &targets, time_sec, want);
+        let found = views.ok().filter(|views| {
+            let explained = explains(&self.config.skip, last, window, views, &self.cameras);
+            if let Err(why) = explained {
+                debug!("window at {} ns is not what was predicted: {why:?}", window.stamp_ns);
+            }
+            explained.is_ok()
+        });
+        self.timings.add("predict", start.elapsed().as_secs_f64() * 1e3);
+        found.map(|views| Predicted { window: Window { map_from_anchor: then.map_from_anchor, ..window.clone() }, views })
+    }
+
+    /// A window that the last computed one explains: its Gaussians at the new time. The map is told nothing: there is nothing new.
+    fn extrapolated(&mut self, predicted: Predicted, last: &Computed, demand: Demand) -> Step {
+        let start = Instant::now();
+        let Predicted { window, views } = predicted;
+        let scene = Arc::new(moved_on(&last.scene, &last.window, &window));
+        self.follow(&scene, &window, demand);
+        let pixels = pixel_flow(&last.window, &window, &views, &self.cameras);
+        let total_ms = start.elapsed().as_secs_f64() * 1e3 + self.timings.newest("predict");
+        let now = Computed { window, scene, views: views.into(), agreement: Arc::clone(&last.agreement), ..last.clone() };
+        let step = self.step(now, demand, Some(Notch::Predicted), total_ms);
+        Step { pixels: Some(pixels), ..step }
     }
 
     /// Runs windows that follow each other, the network on all of them in one forward pass, the rest one by one. In
@@ -185,7 +251,7 @@ impl StepMaker {
         let network_ms = start.elapsed().as_secs_f64() * 1e3 / windows.len() as f64;
         let all = windows.into_iter().zip(scenes);
         all.map(|(window, scene)| {
-            let step = self.take_in(window, scene, network_ms, Demand::ALL, false)?;
+            let step = self.take_in(window, scene, network_ms, Demand::ALL, None)?;
             Ok(self.result(step))
         })
         .collect()
@@ -195,14 +261,14 @@ impl StepMaker {
         StepResult { step, tracks: self.ended_tracks(), objects: self.ended_objects() }
     }
 
-    /// What follows the network. `network_ms` is this window's share of its time; `check` belongs to the gate.
+    /// What follows the network. `network_ms` is this window's share of its time; `shadow` belongs to the gate.
     fn take_in(
         &mut self,
         window: Window<Frame>,
         scene: Result<Scene>,
         network_ms: f64,
         demand: Demand,
-        check: bool,
+        shadow: Option<&Shadow>,
     ) -> Result<Option<Step>> {
         let start = Instant::now();
         self.timings.add("network", network_ms);
@@ -228,7 +294,7 @@ impl StepMaker {
         };
         let agreement = self.timings.time("overlap", || self.overlap.step(&mut scene, &look));
         let newest = window.steps.len() - 1;
-        let views = if demand.pictures || demand.map {
+        let views = if demand.drawn() || self.skipper.wants_views() {
             let targets = views_of(&window.steps[newest], &window.map_from_anchor, &self.cameras);
             let time_sec = newest_time_sec(&window);
             let want = Want { flow: true, motion: demand.motion };
@@ -237,6 +303,7 @@ impl StepMaker {
             Vec::new()
         };
         if demand.map {
+            let first_new = self.first_new(&stamps_ns);
             let look = SceneLook {
                 stamp_ns: window.stamp_ns,
                 map_from_anchor: &window.map_from_anchor,
@@ -245,7 +312,7 @@ impl StepMaker {
                 poses: &poses,
                 rendered: &views,
                 confidence: &agreement.geometry,
-                first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
+                first_new,
             };
             self.timings.time("map", || self.map.fuse_scene(&look));
         } else {
@@ -253,12 +320,22 @@ impl StepMaker {
             self.map.set_origin(window.map_from_anchor.translation);
         }
         let (scene, views, agreement) = (Arc::new(scene), Arc::from(views), Arc::new(agreement));
-        let computed = Computed { window, scene, views, agreement, demand };
-        self.skipper.computed(&computed, check);
+        let computed = Computed { window, scene, views, agreement, demand, approximate: false };
+        self.skipper.computed(&computed, shadow);
         self.follow(&computed.scene, &computed.window, demand);
-        let Computed { window, scene, views, agreement, .. } = computed;
         let total_ms = network_ms + start.elapsed().as_secs_f64() * 1e3;
-        Ok(Some(self.step(window, scene, views, agreement, total_ms)))
+        Ok(Some(self.step(computed, demand, None, total_ms)))
+    }
+
+    /// The first of the newest timesteps that the map was not given before, windows that were skipped left out; it is given them
+    /// now.
+    fn first_new(&mut self, stamps_ns: &[i64]) -> usize {
+        let new = stamps_ns.iter().rev().take_while(|s| !self.fused.contains(s)).count();
+        self.fused.extend(&stamps_ns[stamps_ns.len() - new..]);
+        while self.fused.len() > FUSED_KEPT {
+            self.fused.pop_front();
+        }
+        stamps_ns.len() - new
     }
 
     /// A window that shows what `last` showed: its result, with the new stamps. The map is told nothing, having been told.
@@ -268,7 +345,7 @@ impl StepMaker {
         let window = Window { map_from_anchor: last.window.map_from_anchor, ..window };
         self.follow(&last.scene, &window, demand);
         let total_ms = start.elapsed().as_secs_f64() * 1e3;
-        self.step(window, last.scene, last.views, last.agreement, total_ms)
+        self.step(Computed { window, ..last }, demand, Some(Notch::Still), total_ms)
     }
 
     /// What moves, into the trajectories and the objects.
@@ -288,18 +365,14 @@ impl StepMaker {
         }
     }
 
-    fn step(
-        &mut self,
-        window: Window<Frame>,
-        scene: Arc<Scene>,
-        views: Arc<[RenderedView]>,
-        agreement: Arc<Agreement>,
-        total_ms: f64,
-    ) -> Step {
+    fn step(&mut self, of: Computed, demand: Demand, notch: Option<Notch>, total_ms: f64) -> Step {
         self.timings.add("step", total_ms);
         let index = self.steps;
         self.steps += 1;
-        Step { index, window, scene, views, agreement, total_ms }
+        let Computed { window, scene, views, agreement, .. } = of;
+        // The gate's own views are nobody else's.
+        let views = if demand.drawn() { views } else { Arc::from([]) };
+        Step { index, window, scene, views, agreement, notch, pixels: None, total_ms }
     }
 
     /// Moving objects that have ended since the last call.

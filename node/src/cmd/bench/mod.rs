@@ -1,5 +1,7 @@
 //! `storm bench`: run time of the network, the rasteriser and the drive, on this machine.
 
+mod drives;
+
 use std::path::PathBuf;
 use std::process::Command;
 use std::sync::Arc;
@@ -78,6 +80,7 @@ pub(super) struct Setting {
 
 /// Measures and prints.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
+    if let Ok(set)=std::env::var("DRIVES"){let config=Config::from_arguments(None,&set.split_whitespace().map(String::from).collect::<Vec<_>>())?;let d=drives::run(&config,0.5,&mut |_|{})?;println!("{}",serde_json::to_string_pretty(&d)?);return Ok(Outcome::Done)}
     let models: Vec<String> = match (args.models.is_empty(), args.quick) {
         (false, _) => args.models.clone(),
         (true, true) => vec!["tiny".into()],
@@ -194,6 +197,8 @@ pub(super) fn time_network(name: &str, section: &ModelConfigSection, runs: usize
         scene: Arc::new(scene),
         views: views.into(),
         agreement,
+        notch: None,
+        pixels: None,
         total_ms: 0.0,
     };
     let scores = score(engine.raster_settings(), step, &drive, &cameras)?;
