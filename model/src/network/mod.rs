@@ -6,6 +6,7 @@ mod motion;
 mod output;
 mod params;
 mod resample;
+mod shortcuts;
 mod sky;
 mod stages;
 mod transformer;
@@ -18,6 +19,7 @@ use candle_core::{DType, Device, Tensor};
 pub use output::ClipOutput;
 pub(crate) use params::NORM_EPS;
 use params::Params;
+pub use shortcuts::{MAX_KV_POOL, MAX_MERGE, Precision, Shortcuts};
 pub use stages::Stages;
 
 use crate::clip::ClipBatch;
@@ -106,6 +108,20 @@ impl Storm {
     /// Any 1-10 timesteps, 1-6 cameras (with affine tokens at most `num_cams`, fewer use the first ones) and any
     /// picture size that is a multiple of the patch size.
     pub fn forward(&self, batch: &ClipBatch) -> Result<ClipOutput, ModelError> {
+        self.forward_with(batch, &Shortcuts::default())
+    }
+
+    /// As [`Storm::forward`], with what `shortcuts` leaves out or rounds.
+    ///
+    /// # Errors
+    /// Those of [`Storm::forward`], and shortcuts that do not fit the batch.
+    pub fn forward_with(&self, batch: &ClipBatch, shortcuts: &Shortcuts) -> Result<ClipOutput, ModelError> {
+        let [_, t, v, h, w] = batch.dims()?;
+        self.check_sizes(v, h, w)?;
+        shortcuts.check(t * v * (h / self.config.patch_size) * (w / self.config.patch_size))?;
+        if !shortcuts.exact() {
+            return Err(ModelError::Input("shortcuts are not built yet; use the default".into()));
+        }
         self.forward_stages(batch, &mut Stages::none())
     }
 

@@ -96,6 +96,8 @@ section! {
         image_height: usize = 0,
         /// Threads for the network and the rasteriser; 0: all cores.
         threads: usize = 0,
+        /// Numbers of the transformer's products: `f32`, `bf16` (faster only on processors that have it), `int8` (integer products with exact sums; CPU).
+        precision: String = "f32".into(),
     }
 }
 
@@ -134,6 +136,18 @@ section! {
         max_flow_change: f64 = 0.02,
         /// Largest part of the moving pixels in which the two differ.
         max_mask_change: f64 = 0.01,
+        /// In the middle blocks the keys and values of so many times so many patches of a picture are taken as one, 1 to 4; 1: off.
+        kv_pool: usize = 1,
+        /// Part of the image tokens merged into a neighbour of the same picture, 0 to 0.75; edges and what moves are kept longest. 0: off.
+        merge: f64 = 0.0,
+        /// The last block and the heads work on the newest timestep alone: the map, flow and masks get that timestep's Gaussians only.
+        newest_only: bool = false,
+        /// Patches that were sky in the last step, far from anything else, and have not changed are not computed.
+        sky: bool = false,
+        /// A patch is sky when no pixel of it was more opaque than this.
+        sky_opacity: f64 = 0.05,
+        /// After this many steps with patches left out, all are computed.
+        sky_every: usize = 10,
     }
 }
 
