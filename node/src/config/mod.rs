@@ -117,7 +117,7 @@ section! {
         /// and by more than this many 8-bit levels.
         still_levels: f64 = 1.5,
         /// A window that the last computed Gaussians, moved by their velocities, explain in every patch of the newest pictures takes them, extrapolated.
-        predict: bool = true,
+        predict: bool = false,
         /// Farthest ahead of the last computed step, seconds.
         predict_sec: f64 = 0.5,
         /// Farthest a camera may have moved since, metres.
@@ -127,7 +127,7 @@ section! {
         /// A patch is unexplained when picture less prediction has changed by more than noise, by more than this many 8-bit levels,
         predict_levels: f64 = 4.0,
         /// and by more than the picture changes within this many pixels.
-        predict_px: f64 = 0.5,
+        predict_px: f64 = 1.0,
         /// After this many skipped or approximated steps one is computed in full all the same and compared; 0: nothing is skipped.
         check_every: usize = 100,
         /// Most PSNR such a step may lose against the full one, dB; beyond it the level goes down a notch until a check holds again.

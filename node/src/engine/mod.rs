@@ -175,6 +175,14 @@ impl Engine {
         scenes.pop().context("the network gave no scene")?
     }
 
+    /// The same, leaving nothing out and rounding nothing.
+    pub fn exact_step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
+        let shortcuts = std::mem::take(&mut self.shortcuts);
+        let scene = self.step(window, cameras);
+        self.shortcuts = shortcuts;
+        scene
+    }
+
     /// Runs the network on several windows in one forward pass. One result per window: a window whose result is not
     /// finite does not spoil the others.
     ///

@@ -97,7 +97,12 @@ fn poses(computed: &Window<Frame>, set: &PosedSet<Frame>) -> Vec<Affine3A> {
 }
 
 /// What the pixels of predicted views show.
-pub fn pixel_flow(computed: &Window<Frame>, new: &Window<Frame>, views: &[RenderedView], cameras: &[Intrinsics]) -> PixelFlow {
+pub fn pixel_flow(
+    computed: &Window<Frame>,
+    new: &Window<Frame>,
+    views: &[RenderedView],
+    cameras: &[Intrinsics],
+) -> PixelFlow {
     let mut all = PixelFlow::default();
     let Some(newest) = new.steps.last() else { return all };
     for ((view, pose), camera) in views.iter().zip(poses(computed, newest)).zip(cameras) {
@@ -134,7 +139,8 @@ fn steepness(frame: &Frame, (w, h): (usize, usize)) -> Vec<f32> {
     let pixel = |i: usize| {
         let (x, y) = (i % w, i / w);
         let here = at(x, y);
-        let ways = [(x.saturating_sub(1), y), ((x + 1).min(w - 1), y), (x, y.saturating_sub(1)), (x, (y + 1).min(h - 1))];
+        let ways =
+            [(x.saturating_sub(1), y), ((x + 1).min(w - 1), y), (x, y.saturating_sub(1)), (x, (y + 1).min(h - 1))];
         ways.iter().map(|&(x, y)| (at(x, y) - here).abs()).max().unwrap_or(0) as f32
     };
     (0..w * h).map(pixel).collect()
@@ -160,7 +166,12 @@ impl Known {
         }
         let (a, b) = (x.fract(), y.fract());
         let first = y as usize * k.width + x as usize;
-        let four = [(first, (1.0 - a) * (1.0 - b)), (first + 1, a * (1.0 - b)), (first + k.width, (1.0 - a) * b), (first + k.width + 1, a * b)];
+        let four = [
+            (first, (1.0 - a) * (1.0 - b)),
+            (first + 1, a * (1.0 - b)),
+            (first + k.width, (1.0 - a) * b),
+            (first + k.width + 1, a * b),
+        ];
         let residual = four.iter().map(|&(i, w)| w * f32::from(self.residual[i])).sum();
         let steepness = four.iter().map(|&(i, _)| self.steepness[i]).fold(0.0, f32::max);
         Some((residual, steepness))
@@ -178,7 +189,9 @@ pub fn explains(
     views: &[RenderedView],
     cameras: &[Intrinsics],
 ) -> Result<(), Unexplained> {
-    let (Some(then), Some(now)) = (computed.window.steps.last(), new.steps.last()) else { return Err(Unexplained::Shape) };
+    let (Some(then), Some(now)) = (computed.window.steps.last(), new.steps.last()) else {
+        return Err(Unexplained::Shape);
+    };
     let count = cameras.len();
     if [then.frames.len(), now.frames.len(), computed.views.len(), views.len()].iter().any(|n| *n != count) {
         return Err(Unexplained::Shape);
@@ -230,3 +243,6 @@ pub fn explains(
         }
     })
 }
+
+#[cfg(test)]
+mod tests;

@@ -29,7 +29,7 @@ const MASK_FLOOR: f64 = 0.01;
 const MOST_WAIT: u64 = 16;
 
 /// Of results that cannot be compared.
-const UNLIKE: Difference = Difference { psnr_loss_db: f64::INFINITY, flow: f64::INFINITY, mask: 1.0 };
+pub const UNLIKE: Difference = Difference { psnr_loss_db: f64::INFINITY, flow: f64::INFINITY, mask: 1.0 };
 
 /// What a step gives that can be taken again.
 #[derive(Clone)]
@@ -361,7 +361,8 @@ mod tests {
     #[test]
     fn each_figure_sees_its_own() {
         // 20 and 40 levels off: 6 dB.
-        let d = difference(&pictures(128), &[view(20.5 / 127.5, 0, 0.0)], &[view(40.5 / 127.5, 0, 0.0)], Quat::IDENTITY);
+        let d =
+            difference(&pictures(128), &[view(20.5 / 127.5, 0, 0.0)], &[view(40.5 / 127.5, 0, 0.0)], Quat::IDENTITY);
         assert!((d.psnr_loss_db - 6.0).abs() < 0.2 && d.flow == 0.0 && d.mask == 0.0, "{d:?}");
         // A tenth slower.
         let d = difference(&pictures(128), &[view(0.0, 20, 10.0)], &[view(0.0, 20, 9.0)], Quat::IDENTITY);

@@ -6,16 +6,17 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
-use storm_model::ModelError;
+use glam::Quat;
 use storm_model::scene::{RenderedView, Scene, Want};
+use storm_model::{ModelError, Shortcuts};
 use storm_render::Intrinsics;
 use tracing::{debug, warn};
 
 use crate::config::Config;
 use crate::engine::{Engine, select, views_of};
-use crate::gate::contract::{Notch, Verdict};
+use crate::gate::contract::{Difference, Notch, Verdict};
 use crate::gate::predict::{PixelFlow, explains, moved_on, pixel_flow};
-use crate::gate::skipper::{Computed, Plan, Shadow, SkipCounts, Skipper};
+use crate::gate::skipper::{Computed, Plan, Shadow, SkipCounts, Skipper, UNLIKE, difference};
 use crate::map::{MapError, SceneLook, StaticMap};
 use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
 use crate::overlap::{Agreement, Overlap, OverlapCounts, OverlapLook};
@@ -87,6 +88,13 @@ struct Predicted {
     /// The new window, in the computed one's anchor.
     window: Window<Frame>,
     views: Vec<RenderedView>,
+}
+
+/// What the network said of a window, and how long it took.
+struct Ran {
+    scene: Result<Scene>,
+    ms: f64,
+    approximate: bool,
 }
 
 impl StepMaker {
@@ -201,8 +209,36 @@ impl StepMaker {
             Plan::Compute { shadow } => shadow,
         };
         let start = Instant::now();
-        let scene = self.engine.step(&window, &self.cameras);
-        self.take_in(window, scene, start.elapsed().as_secs_f64() * 1e3, demand, shadow.as_ref())
+        // What a skipped step is compared with leaves nothing out.
+        let verdict = match shadow {
+            None if !self.engine.shortcuts().exact() => self.skipper.may_approximate(),
+            _ => Verdict::Full,
+        };
+        if verdict == Verdict::Skip {
+            let scene = self.engine.step(&window, &self.cameras);
+            let ran = Ran { scene, ms: start.elapsed().as_secs_f64() * 1e3, approximate: true };
+            return self.take_in(window, ran, demand, None);
+        }
+        let scene = self.engine.exact_step(&window, &self.cameras);
+        let ran = Ran { scene, ms: start.elapsed().as_secs_f64() * 1e3, approximate: false };
+        if let (Verdict::Check, Ok(exact)) = (verdict, &ran.scene) {
+            let found = self.approximation(&window, exact)?;
+            self.skipper.approximated(found);
+        }
+        self.take_in(window, ran, demand, shadow.as_ref())
+    }
+
+    /// The window with the configured approximations, in the shadow of the exact step: how the two compare.
+    fn approximation(&mut self, window: &Window<Frame>, exact: &Scene) -> Result<Difference> {
+        let start = Instant::now();
+        let Ok(rough) = self.engine.step(window, &self.cameras) else { return Ok(UNLIKE) };
+        let newest = &window.steps[window.steps.len() - 1];
+        let targets = views_of(newest, &window.map_from_anchor, &self.cameras);
+        let (time_sec, want) = (newest_time_sec(window), Want { flow: true, motion: false });
+        let mut draw = |scene: &Scene| self.engine.render(scene, &targets, time_sec, want);
+        let found = difference(newest, &draw(exact)?, &draw(&rough)?, Quat::IDENTITY);
+        self.timings.add("shadow", start.elapsed().as_secs_f64() * 1e3);
+        Ok(found)
     }
 
     /// The last computed step drawn at the window's newest time and poses, where that explains its pictures everywhere.
@@ -222,7 +258,10 @@ impl StepMaker {
             explained.is_ok()
         });
         self.timings.add("predict", start.elapsed().as_secs_f64() * 1e3);
-        found.map(|views| Predicted { window: Window { map_from_anchor: then.map_from_anchor, ..window.clone() }, views })
+        found.map(|views| Predicted {
+            window: Window { map_from_anchor: then.map_from_anchor, ..window.clone() },
+            views,
+        })
     }
 
     /// A window that the last computed one explains: its Gaussians at the new time. The map is told nothing: there is nothing new.
@@ -233,13 +272,14 @@ impl StepMaker {
         self.follow(&scene, &window, demand);
         let pixels = pixel_flow(&last.window, &window, &views, &self.cameras);
         let total_ms = start.elapsed().as_secs_f64() * 1e3 + self.timings.newest("predict");
-        let now = Computed { window, scene, views: views.into(), agreement: Arc::clone(&last.agreement), ..last.clone() };
+        let now =
+            Computed { window, scene, views: views.into(), agreement: Arc::clone(&last.agreement), ..last.clone() };
         let step = self.step(now, demand, Some(Notch::Predicted), total_ms);
         Step { pixels: Some(pixels), ..step }
     }
 
     /// Runs windows that follow each other, the network on all of them in one forward pass, the rest one by one. In
-    /// order, one result each. Several windows at once are all computed.
+    /// order, one result each. Several windows at once are all computed, exactly.
     pub fn run_all(&mut self, mut windows: Vec<Window<Frame>>) -> Result<Vec<StepResult>> {
         if windows.len() <= 1 {
             let Some(window) = windows.pop() else { return Ok(Vec::new()) };
@@ -247,11 +287,16 @@ impl StepMaker {
             return Ok(vec![self.result(step)]);
         }
         let start = Instant::now();
-        let scenes = self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras)?;
+        let shortcuts = self.engine.shortcuts().clone();
+        self.engine.set_shortcuts(Shortcuts::default());
+        let scenes = self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras);
+        self.engine.set_shortcuts(shortcuts);
+        let scenes = scenes?;
         let network_ms = start.elapsed().as_secs_f64() * 1e3 / windows.len() as f64;
         let all = windows.into_iter().zip(scenes);
         all.map(|(window, scene)| {
-            let step = self.take_in(window, scene, network_ms, Demand::ALL, None)?;
+            let ran = Ran { scene, ms: network_ms, approximate: false };
+            let step = self.take_in(window, ran, Demand::ALL, None)?;
             Ok(self.result(step))
         })
         .collect()
@@ -261,16 +306,16 @@ impl StepMaker {
         StepResult { step, tracks: self.ended_tracks(), objects: self.ended_objects() }
     }
 
-    /// What follows the network. `network_ms` is this window's share of its time; `shadow` belongs to the gate.
+    /// What follows the network; `shadow` belongs to the gate.
     fn take_in(
         &mut self,
         window: Window<Frame>,
-        scene: Result<Scene>,
-        network_ms: f64,
+        ran: Ran,
         demand: Demand,
         shadow: Option<&Shadow>,
     ) -> Result<Option<Step>> {
         let start = Instant::now();
+        let Ran { scene, ms: network_ms, approximate } = ran;
         self.timings.add("network", network_ms);
         let mut scene = match scene {
             Ok(scene) => scene,
@@ -283,8 +328,10 @@ impl StepMaker {
                 _ => return Err(e),
             },
         };
-        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
-        let stamps_ns: Vec<i64> = window.steps.iter().map(|s| s.stamp_ns).collect();
+        // A network told to may give the newest timestep alone.
+        let given = &window.steps[window.steps.len() - scene.shape.timesteps.min(window.steps.len())..];
+        let poses: Vec<Rigid> = given.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
+        let stamps_ns: Vec<i64> = given.iter().map(|s| s.stamp_ns).collect();
         let look = OverlapLook {
             stamps_ns: &stamps_ns,
             epoch: window.epoch,
@@ -320,11 +367,12 @@ impl StepMaker {
             self.map.set_origin(window.map_from_anchor.translation);
         }
         let (scene, views, agreement) = (Arc::new(scene), Arc::from(views), Arc::new(agreement));
-        let computed = Computed { window, scene, views, agreement, demand, approximate: false };
+        let computed = Computed { window, scene, views, agreement, demand, approximate };
         self.skipper.computed(&computed, shadow);
         self.follow(&computed.scene, &computed.window, demand);
         let total_ms = network_ms + start.elapsed().as_secs_f64() * 1e3;
-        Ok(Some(self.step(computed, demand, None, total_ms)))
+        let notch = approximate.then_some(Notch::Approximate);
+        Ok(Some(self.step(computed, demand, notch, total_ms)))
     }
 
     /// The first of the newest timesteps that the map was not given before, windows that were skipped left out; it is given them
@@ -350,7 +398,7 @@ impl StepMaker {
 
     /// What moves, into the trajectories and the objects.
     fn follow(&mut self, scene: &Scene, window: &Window<Frame>, demand: Demand) {
-        let newest = window.steps.len() - 1;
+        let newest = scene.shape.timesteps - 1;
         if demand.tracks {
             let mut points = select::moving_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
             for p in &mut points {

@@ -1,131 +1,236 @@
-//! `storm bench`: run time of the network, the rasteriser and the drive, on this machine.
+//! `storm bench`: run time against error, on this machine: every setting of the network, skipping over drives that stand, cruise and
+//! are busy, the other methods, and cost against size.
 
 mod drives;
+mod flops;
+mod network;
+mod peers;
+mod report;
+mod settings;
+mod sizes;
 
-use std::path::PathBuf;
-use std::process::Command;
-use std::sync::Arc;
-use std::time::Instant;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
-use serde::Serialize;
+use anyhow::Result;
 use serde_json::json;
-use storm_model::scene::Want;
-use storm_render::raster::RasterSettings;
-use storm_render::world::{Drive, DriveOptions};
-use storm_render::{Intrinsics, View};
 
 use super::{Outcome, UsageError, progress_bar};
-use crate::config::{Config, ModelConfigSection};
-use crate::dice::Dice;
-use crate::engine::score::{Scorer, Scores};
-use crate::engine::{Engine, ModelSource, views_of};
-use crate::overlap::Agreement;
-use crate::pipeline::step::{Step, StepMaker, newest_time_sec};
-use crate::pipeline::timing::{StageStats, Timings, peak_rss_mb, reset_peak_rss};
-use crate::source::Frame;
-use crate::source::world::{first_window, posed_set, truth_images};
-use crate::window::Window;
+use crate::config::Config;
+use crate::engine::ModelSource;
+use crate::engine::evaluate::bag::{BagClips, Part};
+use crate::engine::evaluate::{Clip, Method};
+use crate::output::atomic::write_bytes;
 
-/// Drive whose pictures are used; held-out seeds start at 10,000.
-const BENCH_SEED: u64 = 424_242;
-/// Images drawn to time the drive.
-const WORLD_IMAGES: usize = 180;
+pub(super) use network::time_network;
+use network::{Data, References};
+use report::{Baseline, DriveSetting, Report};
+use settings::Named;
 
-/// Steps of a vehicle that waits, and their distance.
-const SKIPPED_STEPS: i64 = 50;
-const SKIP_HOP_NS: i64 = 100_000_000;
-
-/// Held-out frames each network's scene is scored on.
-const SCORED_FRAMES: usize = 4;
+/// Networks whose pictures are larger are measured on fewer clips.
+const CLIPS_OF_UNTRAINED: usize = 2;
+/// The largest network.
+const LARGEST: &str = "b8";
+/// Names of the files under `--out`.
+const DOCUMENT: &str = "bench.md";
+const PICTURE: &str = "bench.svg";
 
 /// Arguments of `storm bench`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Only the small networks.
+    /// Only the smallest network at its first settings, and short drives.
     #[arg(long)]
     quick: bool,
+    /// Write the table and the picture (bench.md, bench.svg) into this folder.
+    #[arg(long)]
+    out: Option<PathBuf>,
     /// Write the figures as JSON.
     #[arg(long)]
     json: Option<PathBuf>,
-    /// Networks to time, comma-separated [default: tiny,small,b8; with --quick: tiny].
+    /// Networks, comma-separated; b8 takes minutes a row, and is measured at few settings [default: tiny,small; with --quick: tiny].
     #[arg(long, value_delimiter = ',')]
     models: Vec<String>,
-    /// Timed runs of each network after one warm-up (the largest: one run, no warm-up).
-    #[arg(long, default_value_t = 5)]
+    /// Another row, `NAME: KEY=VALUE, KEY=VALUE` with any configuration keys; may be given again.
+    #[arg(long = "setting", value_parser = Named::parse)]
+    more: Vec<Named>,
+    /// Only rows whose name contains this.
+    #[arg(long)]
+    only: Option<String>,
+    /// Timed runs of each setting after one warm-up, and at least one of every clip (the largest network: one of every clip).
+    #[arg(long, default_value_t = 7)]
     runs: usize,
+    /// Held-out clips each setting is scored on.
+    #[arg(long, default_value_t = 4)]
+    clips: usize,
+    /// Recorded bag that each setting's pictures are scored on too.
+    #[arg(long)]
+    bag: Option<PathBuf>,
+    /// Clips cut from it.
+    #[arg(long, default_value_t = 3, requires = "bag")]
+    bag_clips: usize,
+    /// Other methods on the same clips, by the names of `storm eval`; gs3d and nsfp take minutes a clip. `none`: none.
+    #[arg(long, default_value = "static,per_frame,per_frame_nearest,nearest_context", value_parser = parse_methods)]
+    methods: std::vec::Vec<Method>,
+    /// Leave the drives with skipping out.
+    #[arg(long)]
+    no_drives: bool,
+    /// Cost against tokens (400 to 10,000), cameras and timesteps as well.
+    #[arg(long)]
+    sizes: bool,
+    /// With 32,000 tokens too.
+    #[arg(long, requires = "sizes")]
+    largest: bool,
     /// A Python with PyTorch: times tests/python/peer_network.py at B/8's size in the same run.
     #[arg(long)]
     peer_python: Option<PathBuf>,
 }
 
-/// One network at one setting.
-#[derive(Debug, Serialize)]
-pub(super) struct Setting {
-    model: String,
-    weights: String,
-    dtype: &'static str,
-    skips: Vec<String>,
-    skipped: u64,
-    pub(super) tokens: usize,
-    gaussians: usize,
-    picture: [usize; 2],
-    pub(super) step_ms: StageStats,
-    stages_ms: std::collections::BTreeMap<String, StageStats>,
-    peak_rss_mb: Option<f64>,
-    psnr: Option<f64>,
-    depth_rmse: Option<f64>,
-    epe3d: Option<f64>,
+fn parse_methods(text: &str) -> Result<Vec<Method>, String> {
+    if text == "none" { Ok(Vec::new()) } else { Method::parse_list(text) }
 }
 
 /// Measures and prints.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
-    if let Ok(set)=std::env::var("DRIVES"){let config=Config::from_arguments(None,&set.split_whitespace().map(String::from).collect::<Vec<_>>())?;let d=drives::run(&config,0.5,&mut |_|{})?;println!("{}",serde_json::to_string_pretty(&d)?);return Ok(Outcome::Done)}
     let models: Vec<String> = match (args.models.is_empty(), args.quick) {
         (false, _) => args.models.clone(),
         (true, true) => vec!["tiny".into()],
-        (true, false) => ["tiny", "small", "b8"].map(String::from).to_vec(),
+        (true, false) => ["tiny", "small"].map(String::from).to_vec(),
     };
-    let bar = progress_bar(progress, models.len() as u64 + 1, "measuring");
-    println!("{}", machine()["cpu"].as_str().unwrap_or("unknown processor"));
-    let (world_fps, world) = time_world()?;
+    let rows = |all: Vec<Named>, quick: usize| -> Vec<Named> {
+        let first = if args.quick { quick } else { all.len() };
+        let wanted = |row: &Named| args.only.as_ref().is_none_or(|part| row.name.contains(part.as_str()));
+        all.into_iter().take(first).chain(args.more.iter().cloned()).filter(wanted).collect()
+    };
+    let (network_rows, drive_rows) = (rows(settings::network(), 3), rows(settings::drives(), 1));
+    let drive_rows = if args.no_drives { Vec::new() } else { drive_rows };
+    // Every row is tried before the first is measured.
+    for row in network_rows.iter().chain(&drive_rows) {
+        for model in &models {
+            row.config(model)?;
+        }
+    }
+    let sizes = if args.sizes { sizes::plan(args.largest) } else { Vec::new() };
+    let steps = models.len() * network_rows.len() + 10 * drive_rows.len() + sizes.len() + args.clips + 1;
+    let bar = progress_bar(progress, steps as u64, "measuring");
+    let mut report = Report {
+        machine: machine(),
+        command: std::iter::once("storm".to_string()).chain(std::env::args().skip(1)).collect::<Vec<_>>().join(" "),
+        load: load(),
+        ..Report::default()
+    };
+    println!("{}", report.machine["cpu"].as_str().unwrap_or("unknown processor"));
+    let (world_fps, world) = peers::time_world()?;
+    report.world = world;
     println!("drive: {world_fps:.0} images of 240x160 with ground truth per second");
     bar.inc(1);
-    let mut settings = Vec::new();
     for model in &models {
-        let section = ModelConfigSection { preset: model.clone(), ..ModelConfigSection::default() };
-        let setting = time_network(model, &section, args.runs)?;
-        println!(
-            "{:6} {:>6} tokens {:>7} Gaussians: step p50 {:>9.1} ms, p99 {:>9.1} ms, network {:>9.1} ms, three views {:>7.1} ms, skipped {:>5.2} ms, peak {:.0} MB",
-            setting.model,
-            setting.tokens,
-            setting.gaussians,
-            setting.step_ms.p50,
-            setting.step_ms.p99,
-            setting.stages_ms["network"].p50,
-            setting.stages_ms["render"].p50,
-            setting.stages_ms.get("skipped step").map_or(f64::NAN, |s| s.p50),
-            setting.peak_rss_mb.unwrap_or(0.0),
-        );
-        settings.push(setting);
+        let base = Named { name: String::new(), set: Vec::new(), large: true }.config(model)?;
+        let trained = matches!(ModelSource::open(&base.model)?, ModelSource::Loaded { .. });
+        let bag = match &args.bag {
+            Some(path) if trained => bag_clips(path, &base, args.bag_clips)?,
+            _ => Vec::new(),
+        };
+        let clips = match (trained, model == LARGEST) {
+            (true, _) => args.clips,
+            (false, true) => 1,
+            (false, false) => args.clips.min(CLIPS_OF_UNTRAINED),
+        };
+        let data = Data::held_out(&base, clips, bag)?;
+        let mut references = References::new();
+        for row in network_rows.iter().filter(|row| row.large || model != LARGEST) {
+            bar.set_message(format!("{model}, {}", row.name));
+            let config = row.config(model)?;
+            let s = network::measure(model, &row.name, &row.set, &config, &data, &mut references, args.runs)?;
+            let text = |x: Option<f64>| x.map_or("-".to_string(), |x| format!("{x:.3}"));
+            bar.suspend(|| {
+                println!(
+                    "{:6} {:36} {:>6} tokens {:>8.1} GFLOP: step p50 {:>8.1} ms, p99 {:>8.1} ms, network {:>8.1} ms, three views {:>6.1} ms, peak {:.0} MB; against {}: PSNR {} dB, EPE3D {} m/s",
+                    s.model,
+                    s.setting,
+                    s.tokens,
+                    s.gflop,
+                    s.step_ms.p50,
+                    s.step_ms.p99,
+                    s.stages_ms["network"].p50,
+                    s.stages_ms["render"].p50,
+                    s.peak_rss_mb.unwrap_or(0.0),
+                    s.against,
+                    text(s.figures.psnr),
+                    text(s.figures.epe3d),
+                );
+            });
+            report.settings.push(s);
+            bar.inc(1);
+        }
+        if trained {
+            bar.set_message("other methods");
+            let figures = peers::baselines(&data, &args.methods, &mut || bar.inc(1))?;
+            report.baselines = figures.into_iter().map(|(method, figures)| Baseline { method, figures }).collect();
+        }
+    }
+    for row in &drive_rows {
+        bar.set_message(format!("drives, {}", row.name));
+        let from = bar.position();
+        let share = if args.quick { 0.4 } else { 1.0 };
+        let drives =
+            drives::run(&row.config("tiny")?, share, &mut |part| bar.set_position(from + (10.0 * part) as u64))?;
+        bar.suspend(|| {
+            for r in &drives.rows {
+                println!(
+                    "{:10} {:44} {:>4} steps, {:>4} still, {:>4} predicted, {:>4} approximate: {:>7.1} ms a step, in full {:>7.1} ms: {:.2} times less",
+                    r.drive, row.name, r.steps, r.still, r.predicted, r.approximate, r.ms, r.full_ms, r.ratio
+                );
+            }
+        });
+        report.drives.push(DriveSetting { setting: row.name.clone(), skips: row.set.clone(), drives });
+    }
+    for (curve, size) in sizes {
+        bar.set_message(format!("cost against {curve}"));
+        let p = sizes::measure(curve, size)?;
+        bar.suspend(|| {
+            println!("{curve}: {:>6} tokens {:>9.2} GFLOP {:>9.1} ms", p.tokens, p.gflop, p.network_ms);
+        });
+        report.sizes.push(p);
         bar.inc(1);
     }
-    let peer = match &args.peer_python {
-        Some(python) => Some(time_peer(python)?),
-        None => None,
-    };
-    if let (Some(peer), Some(b8)) = (&peer, settings.iter().find(|s| s.model == "b8")) {
-        let seconds = peer["median_s"].as_f64().unwrap_or(f64::NAN);
-        let ours = b8.stages_ms["network"].p50 / 1e3;
-        println!("PyTorch fp32 at B/8's size: {seconds:.1} s; ours {ours:.1} s; ratio {:.2}", ours / seconds);
+    if let Some(python) = &args.peer_python {
+        bar.set_message("PyTorch");
+        report.peer_pytorch = Some(peers::time_peer(python)?);
     }
     bar.finish_and_clear();
-    if let Some(path) = &args.json {
-        let report = json!({"machine": machine(), "settings": settings, "world": world, "peer_pytorch": peer});
-        std::fs::write(path, serde_json::to_string_pretty(&report)? + "\n")
-            .with_context(|| format!("cannot write {}", path.display()))?;
+    if let Some(peer) = &report.peer_pytorch {
+        let seconds = peer["median_s"].as_f64().unwrap_or(f64::NAN);
+        println!("PyTorch f32 at B/8's size: {seconds:.1} s");
+        if let Some(b8) = report.settings.iter().find(|s| s.model == LARGEST) {
+            let ours = b8.stages_ms["network"].p50 / 1e3;
+            println!("ours {ours:.1} s; ratio {:.2}", ours / seconds);
+        }
     }
+    write(args, &report)?;
     Ok(Outcome::Done)
+}
+
+fn write(args: &Args, report: &Report) -> Result<()> {
+    if let Some(dir) = &args.out {
+        std::fs::create_dir_all(dir)
+            .map_err(|e| UsageError(format!("cannot make the folder {}: {e}", dir.display())))?;
+        write_bytes(&dir.join(DOCUMENT), report.markdown(PICTURE).as_bytes())?;
+        write_bytes(&dir.join(PICTURE), report.picture().as_bytes())?;
+    }
+    if let Some(path) = &args.json {
+        write_bytes(path, (serde_json::to_string_pretty(report)? + "\n").as_bytes())?;
+    }
+    Ok(())
+}
+
+fn bag_clips(path: &Path, config: &Config, clips: usize) -> Result<Vec<Clip>> {
+    let size = ModelSource::open(&config.model)?.picture_size(&config.model)?;
+    let part = Part { from_sec: 0.0, to_sec: f64::INFINITY, clips: clips.max(1) };
+    let mut all = Vec::new();
+    BagClips::open(path, config, size, &part)?.each(|clip| {
+        all.push(clip);
+        Ok(())
+    })?;
+    Ok(all)
 }
 
 fn machine() -> serde_json::Value {
@@ -140,144 +245,7 @@ fn machine() -> serde_json::Value {
     json!({"cpu": field("model name"), "threads": rayon::current_num_threads(), "simd": simd, "version": env!("CARGO_PKG_VERSION")})
 }
 
-fn time_world() -> Result<(f64, serde_json::Value)> {
-    let options = DriveOptions { seed: BENCH_SEED, seconds: 10.0, width: 240, height: 160, ..DriveOptions::default() };
-    let drive = Drive::new(&options)?;
-    let cameras = drive.cameras().len();
-    drive.render(0, 0.0);
-    let start = Instant::now();
-    for i in 0..WORLD_IMAGES {
-        let frame = (i / cameras) % drive.frame_count();
-        std::hint::black_box(drive.render(i % cameras, drive.frame_time_sec(frame, i % cameras)));
-    }
-    let fps = WORLD_IMAGES as f64 / start.elapsed().as_secs_f64();
-    Ok((fps, json!({"images_per_sec": fps, "picture": [240, 160], "images": WORLD_IMAGES})))
-}
-
-/// Step times of the network that a configuration names, on a drive of its own size.
-pub(super) fn time_network(name: &str, section: &ModelConfigSection, runs: usize) -> Result<Setting> {
-    let config = Config::default();
-    let source = ModelSource::open(section)?;
-    let (width, height) = source.picture_size(section)?;
-    let options = DriveOptions { seed: BENCH_SEED, seconds: 2.0, cameras: 3, width, height, ..DriveOptions::default() };
-    let drive = Drive::new(&options).map_err(|e| UsageError(e.to_string()))?;
-    let window = first_window(&drive, &config.window, 1).context("the drive gave no window")?;
-    let cameras: Vec<Intrinsics> = drive.cameras().iter().map(|c| c.intrinsics).collect();
-    reset_peak_rss();
-    let mut engine = Engine::new(source, section, cameras.len(), config.window.timespan_sec)?;
-    let network = engine.model_config().clone();
-    let grid = (height / network.patch_size) * (width / network.patch_size);
-    let tokens = grid * cameras.len() * config.window.timesteps + network.auxiliary_tokens();
-    // A step of the largest networks takes minutes of processor time: one run says enough.
-    let large = network.embed_dim >= 768;
-    let (warm, runs) = if large { (0, 1) } else { (1, runs.max(1)) };
-    let mut timings = Timings::default();
-    let mut last = None;
-    for run in 0..warm + runs {
-        let mut once = Timings::default();
-        let start = Instant::now();
-        let scene = once.time("network", || engine.step(&window, &cameras))?;
-        let targets: Vec<(View, Option<usize>)> =
-            views_of(&window.steps[window.steps.len() - 1], &window.map_from_anchor, &cameras);
-        let want = Want { flow: true, motion: true };
-        let views = once.time("render", || engine.render(&scene, &targets, newest_time_sec(&window), want))?;
-        once.add("step", start.elapsed().as_secs_f64() * 1e3);
-        last = Some((scene, views));
-        if run >= warm {
-            timings.merge(once);
-        }
-    }
-    let peak_rss_mb = peak_rss_mb();
-    let (scene, views) = last.context("no run")?;
-    let gaussians = scene.gaussians.len();
-    let agreement = Arc::new(Agreement::default());
-    let step = Step {
-        index: 0,
-        window: window.clone(),
-        scene: Arc::new(scene),
-        views: views.into(),
-        agreement,
-        notch: None,
-        pixels: None,
-        total_ms: 0.0,
-    };
-    let scores = score(engine.raster_settings(), step, &drive, &cameras)?;
-    let weights = engine.weights().to_string();
-    let skipped = if large { 0 } else { time_skipped(engine, window, cameras, &mut timings)? };
-    let stages_ms = timings.stats();
-    Ok(Setting {
-        model: name.into(),
-        weights,
-        dtype: "f32",
-        skips: Vec::new(),
-        skipped,
-        tokens,
-        gaussians,
-        picture: [width, height],
-        step_ms: stages_ms["step"].clone(),
-        stages_ms,
-        peak_rss_mb,
-        psnr: scores.as_ref().and_then(|s| s.storm.psnr),
-        depth_rmse: scores.as_ref().and_then(|s| s.storm.depth_rmse),
-        epe3d: scores.as_ref().and_then(|s| s.storm.epe3d),
-    })
-}
-
-/// Steps that see the window again, with other noise: the vehicle waits. How many of them were skipped.
-fn time_skipped(engine: Engine, window: Window<Frame>, cameras: Vec<Intrinsics>, timings: &mut Timings) -> Result<u64> {
-    let mut maker = StepMaker::new(engine, cameras, &Config::default(), None)?;
-    maker.run(window.clone())?;
-    let mut dice = Dice::new(BENCH_SEED);
-    for k in 1..=SKIPPED_STEPS {
-        let mut again = window.clone();
-        again.stamp_ns += k * SKIP_HOP_NS;
-        for set in &mut again.steps {
-            let mut one = (**set).clone();
-            one.stamp_ns += k * SKIP_HOP_NS;
-            for frame in &mut one.frames {
-                let mut rgb = (*frame.item.rgb).clone();
-                rgb.data.iter_mut().for_each(|x| *x = x.saturating_add(dice.below(3) as u8).saturating_sub(1));
-                frame.item = Frame { rgb: Arc::new(rgb) };
-            }
-            *set = Arc::new(one);
-        }
-        let before = maker.skips().still;
-        let start = Instant::now();
-        maker.run(again)?;
-        if maker.skips().still > before {
-            timings.add("skipped step", start.elapsed().as_secs_f64() * 1e3);
-        }
-    }
-    Ok(maker.skips().still)
-}
-
-/// The window's scene against the frames between its timesteps.
-fn score(settings: RasterSettings, step: Step, drive: &Drive, cameras: &[Intrinsics]) -> Result<Option<Scores>> {
-    let mut scorer = Scorer::new(settings, cameras.to_vec(), SCORED_FRAMES)?;
-    for frame in 0..drive.frame_count() {
-        let (set, truth) = posed_set(drive, frame);
-        for (camera, t) in truth.into_iter().enumerate() {
-            let stamp_ns = set.frames[camera].stamp_ns;
-            truth_images(t).into_iter().for_each(|(kind, image)| scorer.truth(camera, stamp_ns, kind, image));
-        }
-        scorer.set(Arc::new(set));
-    }
-    scorer.step(Arc::new(step))?;
-    scorer.finish()
-}
-
-fn time_peer(python: &PathBuf) -> Result<serde_json::Value> {
-    let script = "tests/python/peer_network.py";
-    let output = Command::new(python)
-        .arg(script)
-        .output()
-        .with_context(|| format!("cannot run {} {script} (from the project's root)", python.display()))?;
-    let text = String::from_utf8_lossy(&output.stdout);
-    let mut peer: serde_json::Value = serde_json::from_str(text.trim()).with_context(|| {
-        format!("the peer failed: {}", String::from_utf8_lossy(&output.stderr).lines().last().unwrap_or("no output"))
-    })?;
-    let mut seconds: Vec<f64> = peer["seconds"].as_array().into_iter().flatten().filter_map(|x| x.as_f64()).collect();
-    seconds.sort_by(f64::total_cmp);
-    peer["median_s"] = json!(seconds.get(seconds.len() / 2));
-    Ok(peer)
+/// Mean number of running programs over the last minute.
+fn load() -> Option<f64> {
+    std::fs::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
 }
