@@ -1,47 +1,7 @@
 //! What a forward pass may leave out or round, chosen anew for every pass. The default leaves nothing out.
 
-use std::fmt;
-use std::str::FromStr;
-
 use crate::error::ModelError;
-
-/// In what numbers the transformer's linear layers and attention products are taken. Norms, softmax, activations, residuals,
-/// embeddings and heads are f32 in all of them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Precision {
-    /// f32 throughout.
-    #[default]
-    F32,
-    /// Operands rounded to bf16, sums in f32.
-    Bf16,
-    /// Integer operands with exact 32-bit sums: weights in 8 bits with a scale per output, inputs in up to 15 bits with a
-    /// scale per row, whatever lets no sum overflow.
-    Int8,
-}
-
-impl Precision {
-    /// All, with the names they are configured by.
-    pub const ALL: [(Self, &'static str); 3] = [(Self::F32, "f32"), (Self::Bf16, "bf16"), (Self::Int8, "int8")];
-}
-
-impl fmt::Display for Precision {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let name = Self::ALL.iter().find(|(p, _)| p == self).map_or("", |(_, name)| name);
-        f.write_str(name)
-    }
-}
-
-impl FromStr for Precision {
-    type Err = ModelError;
-
-    fn from_str(text: &str) -> Result<Self, ModelError> {
-        let found = Self::ALL.iter().find(|(_, name)| *name == text);
-        found.map(|(precision, _)| *precision).ok_or_else(|| {
-            let names = Self::ALL.map(|(_, name)| name).join(", ");
-            ModelError::Input(format!("precision '{text}' is not known; use one of {names}"))
-        })
-    }
-}
+use crate::ops::Precision;
 
 /// Largest side of a block of patches whose keys and values are pooled.
 pub const MAX_KV_POOL: usize = 4;
@@ -100,16 +60,6 @@ impl Shortcuts {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_are_read_back() {
-        for (precision, name) in Precision::ALL {
-            assert_eq!(name.parse::<Precision>().unwrap(), precision);
-            assert_eq!(precision.to_string(), name);
-        }
-        let error = "int4".parse::<Precision>().unwrap_err().to_string();
-        assert!(error.contains("int4") && error.contains("int8"), "{error}");
-    }
 
     #[test]
     fn values_that_do_not_fit_are_named() {
