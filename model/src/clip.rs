@@ -123,6 +123,17 @@ impl ClipBatch {
         })
     }
 
+    /// Window `index` of the batch, as a batch of one.
+    pub(crate) fn window(&self, index: usize) -> Result<Self, ModelError> {
+        Ok(Self {
+            image: self.image.narrow(0, index, 1)?,
+            intrinsics: self.intrinsics.narrow(0, index, 1)?,
+            world_from_camera: self.world_from_camera.narrow(0, index, 1)?,
+            time_sec: self.time_sec.narrow(0, index, 1)?,
+            timespan_sec: self.timespan_sec,
+        })
+    }
+
     /// `(b, t, v, h, w)`, after checking that all tensors agree.
     pub(crate) fn dims(&self) -> Result<[usize; 5], ModelError> {
         let &[b, t, v, 3, h, w] = self.image.dims() else {

@@ -12,6 +12,7 @@
 mod arrange;
 mod chain;
 mod graph;
+mod precision;
 mod process;
 mod training;
 
@@ -19,13 +20,15 @@ use std::sync::{Arc, OnceLock};
 
 use candle_core::{D, Result, Tensor, TensorId};
 
+use crate::kernels::attention::{Inputs, Rows, Shape};
 use crate::kernels::gemm::{self, Epilogue, PackedWeight};
-use crate::kernels::tensors::{covered, tracked, with_optional, with_values};
+use crate::kernels::tensors::{covered, tracked, with_all, with_optional, with_values};
 use crate::kernels::{self, Isa};
 use crate::plain;
 
 pub(crate) use arrange::{gaussians, patches, unnest};
 pub use chain::{Step, chain};
+pub use precision::Precision;
 pub use process::{keep_freed_memory, set_up_training};
 
 /// A linear layer: weight `(out, in)` as PyTorch stores it, optional bias `(out)`.
@@ -40,13 +43,21 @@ pub struct Linear {
     pub weight: Tensor,
     /// `(out)`.
     pub bias: Option<Tensor>,
-    packed: Arc<OnceLock<(TensorId, Arc<PackedWeight>)>>,
+    precision: Precision,
+    /// By precision.
+    packed: Arc<[OnceLock<(TensorId, Arc<PackedWeight>)>; Precision::ALL.len()]>,
 }
 
 impl Linear {
     /// A layer of a weight `(out, in)` and a bias `(out)`.
     pub fn new(weight: Tensor, bias: Option<Tensor>) -> Self {
-        Self { weight, bias, packed: Arc::default() }
+        Self { weight, bias, precision: Precision::F32, packed: Arc::default() }
+    }
+
+    /// The same layer, its products taken in this precision.
+    #[must_use]
+    pub fn at(&self, precision: Precision) -> Self {
+        Self { precision, ..self.clone() }
     }
 
     /// Makes the kernel's layout now, so that the first step is not slower than the others. Nothing to do for weights
@@ -60,7 +71,10 @@ impl Linear {
 
     fn pack(&self) -> Result<Arc<PackedWeight>> {
         let (n, k) = self.weight.dims2()?;
-        with_values(&self.weight, |values| Ok(Arc::new(PackedWeight::new(Isa::detect(), values, n, k))))
+        let precision = if self.weight.track_op() { Precision::F32 } else { self.precision };
+        with_values(&self.weight, |values| {
+            Ok(Arc::new(PackedWeight::in_precision(Isa::detect(), precision, values, n, k)))
+        })
     }
 
     /// The kernel's layout of the weight as it is now.
@@ -69,11 +83,12 @@ impl Linear {
             return self.pack();
         }
         let id = self.weight.id();
-        if self.packed.get().is_none() {
+        let slot = &self.packed[self.precision as usize];
+        if slot.get().is_none() {
             // Two threads may both get here; the first to finish wins and the other's work is dropped.
-            let _ = self.packed.set((id, self.pack()?));
+            let _ = slot.set((id, self.pack()?));
         }
-        match self.packed.get() {
+        match slot.get() {
             Some((packed_id, packed)) if *packed_id == id => Ok(Arc::clone(packed)),
             _ => self.pack(),
         }
@@ -105,6 +120,11 @@ pub enum Activation {
 
 /// See [`plain::attention`]. The kernel never holds the `n x n` weights.
 pub fn attention(qkv: &Tensor, heads: usize) -> Result<Tensor> {
+    attention_at(qkv, heads, Precision::F32)
+}
+
+/// The same with products in this precision.
+pub fn attention_at(qkv: &Tensor, heads: usize, precision: Precision) -> Result<Tensor> {
     let (batch, tokens, d3) = qkv.dims3()?;
     if heads == 0 || d3 == 0 || d3 % (3 * heads) != 0 {
         candle_core::bail!("attention: {d3} channels are not 3 x {heads} heads x a whole head size");
@@ -112,16 +132,73 @@ pub fn attention(qkv: &Tensor, heads: usize) -> Result<Tensor> {
     if !covered([qkv]) || batch * tokens == 0 {
         return plain::attention(qkv, heads);
     }
-    let shape = kernels::attention::Shape { batch, tokens, heads, head_dim: d3 / 3 / heads };
+    let shape = Shape { batch, tokens, heads, head_dim: d3 / 3 / heads };
     if qkv.track_op() {
         return training::attention(qkv, shape);
     }
     let mut out = vec![0f32; batch * tokens * d3 / 3];
     with_values(qkv, |values| {
-        kernels::attention::attention(Isa::detect(), values, shape, &mut out);
+        let rounded = rounded(precision, values);
+        let values = rounded.as_deref().unwrap_or(values);
+        let rows = |part: usize| Rows { values, stride: d3, first: part * d3 / 3 };
+        let inputs = Inputs { queries: rows(0), keys: rows(1), values: rows(2), count: tokens, bias: None };
+        attend(precision, &inputs, shape, &mut out);
         Ok(())
     })?;
     Tensor::from_vec(out, (batch, tokens, d3 / 3), qkv.device())
+}
+
+/// Values rounded to bf16, where that is the precision.
+fn rounded(precision: Precision, values: &[f32]) -> Option<Vec<f32>> {
+    (precision == Precision::Bf16).then(|| values.iter().map(|&x| kernels::math::bf16(x)).collect())
+}
+
+fn attend(precision: Precision, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32]) {
+    match precision {
+        Precision::F32 | Precision::Bf16 => kernels::attention::attention_of(Isa::detect(), inputs, shape, out),
+        Precision::Int16 | Precision::Int8 => kernels::attention::attention_in_pairs(Isa::detect(), inputs, shape, out),
+    }
+}
+
+/// See [`plain::cross_attention`]; products in this precision.
+pub fn cross_attention(
+    queries: &Tensor,
+    keys_values: &Tensor,
+    sizes: Option<&[f32]>,
+    heads: usize,
+    precision: Precision,
+) -> Result<Tensor> {
+    let (batch, tokens, d) = queries.dims3()?;
+    let (b, count, d2) = keys_values.dims3()?;
+    if heads == 0 || d == 0 || d % heads != 0 || d2 != 2 * d || b != batch || count == 0 {
+        candle_core::bail!(
+            "attention: queries {:?} of {heads} heads and keys with values {:?}",
+            queries.dims(),
+            keys_values.dims()
+        );
+    }
+    if let Some(sizes) = sizes
+        && sizes.len() != count
+    {
+        candle_core::bail!("attention: {} sizes for {count} keys", sizes.len());
+    }
+    let inputs = [queries, keys_values];
+    if !covered(inputs) || tracked(inputs) || queries.elem_count() == 0 {
+        return plain::cross_attention(queries, keys_values, sizes, heads);
+    }
+    let shape = Shape { batch, tokens, heads, head_dim: d / heads };
+    let bias: Option<Vec<f32>> = sizes.map(|sizes| sizes.iter().map(|s| s.log2()).collect());
+    let mut out = vec![0f32; queries.elem_count()];
+    with_all(inputs, |[queries, keys_values]| {
+        let (q, kv) = (rounded(precision, queries), rounded(precision, keys_values));
+        let (queries, kv) = (q.as_deref().unwrap_or(queries), kv.as_deref().unwrap_or(keys_values));
+        let half = |first: usize| Rows { values: kv, stride: d2, first };
+        let queries = Rows { values: queries, stride: d, first: 0 };
+        let inputs = Inputs { queries, keys: half(0), values: half(d), count, bias: bias.as_deref() };
+        attend(precision, &inputs, shape, &mut out);
+        Ok(())
+    })?;
+    Tensor::from_vec(out, (batch, tokens, d), queries.device())
 }
 
 /// See [`plain::linear`]. The kernel adds the bias, the activation and the residual while the sums are in cache.

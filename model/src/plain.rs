@@ -20,6 +20,27 @@ pub fn attention(qkv: &Tensor, heads: usize) -> Result<Tensor> {
     weights.matmul(&v)?.transpose(1, 2)?.reshape((b, n, heads * head_dim))
 }
 
+/// [`attention`] of queries `(b, n, heads * head_dim)` on other tokens' keys and values `(b, m, 2 * heads * head_dim)`, rows
+/// `[k | v]`. A key that stands for `sizes[i]` tokens counts as many times (Bolya et al., "Token Merging", 2023, section 3).
+pub fn cross_attention(queries: &Tensor, keys_values: &Tensor, sizes: Option<&[f32]>, heads: usize) -> Result<Tensor> {
+    let (b, n, d) = queries.dims3()?;
+    let (m, head_dim) = (keys_values.dim(1)?, d / heads);
+    let q = queries.reshape((b, n, heads, head_dim))?.transpose(1, 2)?.contiguous()?;
+    let q = (q * (head_dim as f64).powf(-0.5))?;
+    let parts = keys_values.reshape((b, m, 2, heads, head_dim))?.permute((2, 0, 3, 1, 4))?;
+    let (k, v) = (parts.get(0)?.contiguous()?, parts.get(1)?.contiguous()?);
+    let logits = q.matmul(&k.transpose(2, 3)?.contiguous()?)?;
+    let logits = match sizes {
+        Some(sizes) => {
+            let sizes = Tensor::from_slice(sizes, m, q.device())?.to_dtype(q.dtype())?;
+            logits.broadcast_add(&sizes.log()?)?
+        }
+        None => logits,
+    };
+    let weights = candle_nn::ops::softmax(&logits, D::Minus1)?;
+    weights.matmul(&v)?.transpose(1, 2)?.reshape((b, n, d))
+}
+
 /// `act(x w^T + bias) + residual`; `x` is `(..., k)`, `w` `(n, k)`.
 pub fn linear(x: &Tensor, layer: &Linear, act: Activation, residual: Option<&Tensor>) -> Result<Tensor> {
     let dims = x.dims().to_vec();

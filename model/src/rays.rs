@@ -63,6 +63,15 @@ fn host(tensor: &Tensor) -> Result<Vec<f64>, ModelError> {
 }
 
 impl Rays {
+    /// One timestep's, without what the embedding took.
+    pub fn timestep(&self, t: usize) -> Result<Self, ModelError> {
+        Ok(Self {
+            origins: self.origins.narrow(1, t, 1)?.contiguous()?,
+            directions: self.directions.narrow(1, t, 1)?.contiguous()?,
+            plucker: self.plucker.clone(),
+        })
+    }
+
     /// Rays of a batch in f64 on the host, rounded once to the type of its pictures.
     pub fn new(config: &ModelConfig, batch: &ClipBatch) -> Result<Self, ModelError> {
         match batch.image.dtype() {

@@ -22,8 +22,16 @@ const PHI: [f32; 10] = [
 ];
 /// Past this many standard deviations the tail (under 1e-9) is taken as zero.
 const PHI_END: f32 = 6.0;
+/// The nearest bf16, ties to even; NaN stays NaN.
+#[inline(always)]
+pub(crate) fn bf16(x: f32) -> f32 {
+    let bits = x.to_bits();
+    let rounded = bits.wrapping_add(0x7fff + (bits >> 16 & 1)) & 0xffff_0000;
+    if x.is_nan() { x } else { f32::from_bits(rounded) }
+}
+
 /// Added to a float of at most 2^22 it leaves the nearest whole number in the low bits.
-const ROUND: f32 = 12_582_912.0;
+pub(crate) const ROUND: f32 = 12_582_912.0;
 /// The smallest exponent of a normal float: smaller powers are returned as 2^-126.
 const MIN_EXPONENT: f32 = -126.0;
 
@@ -51,6 +59,21 @@ pub(crate) fn exp2_short<S: Simd>(x: S::V) -> S::V {
     let f = S::sub(x, S::sub(t, S::splat(ROUND)));
     let mut p = S::splat(EXP2_SHORT[4]);
     for c in [EXP2_SHORT[3], EXP2_SHORT[2], EXP2_SHORT[1], EXP2_SHORT[0], 1.0] {
+        p = S::mul_add(p, f, S::splat(c));
+    }
+    S::scale(p, t)
+}
+
+/// `2^f = 1 + f P(f)` on `|f| <= 1/2`; relative error 7e-6.
+const EXP2_ROUGH: [f32; 4] = [0.693_136_73, 0.240_225_3, 0.055_838_283, 0.009_656_71];
+
+/// `2^x` for `|x| <= 120`, nothing else; relative error under 8e-6. NaN gives some number: keep it out.
+#[inline(always)]
+pub(crate) fn exp2_rough<S: Simd>(x: S::V) -> S::V {
+    let t = S::add(x, S::splat(ROUND));
+    let f = S::sub(x, S::sub(t, S::splat(ROUND)));
+    let mut p = S::splat(EXP2_ROUGH[3]);
+    for c in [EXP2_ROUGH[2], EXP2_ROUGH[1], EXP2_ROUGH[0], 1.0] {
         p = S::mul_add(p, f, S::splat(c));
     }
     S::scale(p, t)

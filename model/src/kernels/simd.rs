@@ -34,6 +34,13 @@ pub(crate) trait Simd: Copy + 'static {
     fn exponent(t: Self::V) -> Self::V;
     /// `p 2^n` for `t = 1.5 * 2^23 + n`, by adding `n` to the exponent: `p` and the result must be normal numbers.
     fn scale(p: Self::V, t: Self::V) -> Self::V;
+    /// Per lane, all three seen as bits: `c` plus the sum of the two products of the 16-bit whole numbers in `a` and `b`,
+    /// in 32 bits that wrap.
+    fn mul_add_pairs(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// Per lane: the 32-bit whole number that the bits are, as a float.
+    fn whole_to_float(a: Self::V) -> Self::V;
+    /// Per lane: the low 16 bits of `low`, and above them those of `high`.
+    fn pair(low: Self::V, high: Self::V) -> Self::V;
 
     fn zero() -> Self::V {
         Self::splat(0.0)
@@ -156,6 +163,23 @@ impl<const W: usize, const FMA: bool> Simd for Lanes<W, FMA> {
     fn scale(p: Self::V, t: Self::V) -> Self::V {
         lanewise!(W, |i| f32::from_bits(p[i].to_bits().wrapping_add(t[i].to_bits() << 23)))
     }
+    #[inline(always)]
+    fn mul_add_pairs(a: Self::V, b: Self::V, c: Self::V) -> Self::V {
+        let halves = |x: f32| (i32::from(x.to_bits() as i16), (x.to_bits() as i32) >> 16);
+        lanewise!(W, |i| {
+            let ((a0, a1), (b0, b1)) = (halves(a[i]), halves(b[i]));
+            let sum = (a0 * b0).wrapping_add(a1 * b1);
+            f32::from_bits((c[i].to_bits() as i32).wrapping_add(sum) as u32)
+        })
+    }
+    #[inline(always)]
+    fn whole_to_float(a: Self::V) -> Self::V {
+        lanewise!(W, |i| a[i].to_bits() as i32 as f32)
+    }
+    #[inline(always)]
+    fn pair(low: Self::V, high: Self::V) -> Self::V {
+        lanewise!(W, |i| f32::from_bits(low[i].to_bits() & 0xffff | high[i].to_bits() << 16))
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -241,6 +265,27 @@ mod avx2 {
             unsafe {
                 let n = _mm256_slli_epi32::<23>(_mm256_castps_si256(t));
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), n))
+            }
+        }
+        #[inline(always)]
+        fn mul_add_pairs(a: __m256, b: __m256, c: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe {
+                let sums = _mm256_madd_epi16(_mm256_castps_si256(a), _mm256_castps_si256(b));
+                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(c), sums))
+            }
+        }
+        #[inline(always)]
+        fn whole_to_float(a: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe { _mm256_cvtepi32_ps(_mm256_castps_si256(a)) }
+        }
+        #[inline(always)]
+        fn pair(low: __m256, high: __m256) -> __m256 {
+            // SAFETY: AVX2 was detected (see the impl).
+            unsafe {
+                let high = _mm256_slli_epi32::<16>(_mm256_castps_si256(high));
+                _mm256_castsi256_ps(_mm256_blend_epi16::<0xaa>(_mm256_castps_si256(low), high))
             }
         }
     }

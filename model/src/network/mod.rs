@@ -6,8 +6,10 @@ mod motion;
 mod output;
 mod params;
 mod resample;
+mod shortcuts;
 mod sky;
 mod stages;
+mod tokens;
 mod transformer;
 mod upsample;
 
@@ -18,7 +20,9 @@ use candle_core::{DType, Device, Tensor};
 pub use output::ClipOutput;
 pub(crate) use params::NORM_EPS;
 use params::Params;
+pub use shortcuts::{MAX_KV_POOL, MAX_MERGE, Shortcuts};
 pub use stages::Stages;
+use tokens::{Grid, TokenPlan};
 
 use crate::clip::ClipBatch;
 use crate::config::ModelConfig;
@@ -106,22 +110,56 @@ impl Storm {
     /// Any 1-10 timesteps, 1-6 cameras (with affine tokens at most `num_cams`, fewer use the first ones) and any
     /// picture size that is a multiple of the patch size.
     pub fn forward(&self, batch: &ClipBatch) -> Result<ClipOutput, ModelError> {
-        self.forward_stages(batch, &mut Stages::none())
+        self.forward_with(batch, &Shortcuts::default())
+    }
+
+    /// As [`Storm::forward`], with what `shortcuts` leaves out or rounds.
+    ///
+    /// # Errors
+    /// Those of [`Storm::forward`], and shortcuts that do not fit the batch.
+    pub fn forward_with(&self, batch: &ClipBatch, shortcuts: &Shortcuts) -> Result<ClipOutput, ModelError> {
+        let [b, ..] = batch.dims()?;
+        if shortcuts.merge > 0.0 && b > 1 {
+            // Windows may merge to different numbers of tokens.
+            let each = (0..b).map(|i| self.run(&batch.window(i)?, shortcuts, &mut Stages::none()));
+            return ClipOutput::stack(&each.collect::<Result<Vec<_>, _>>()?);
+        }
+        self.run(batch, shortcuts, &mut Stages::none())
     }
 
     /// As [`Storm::forward`], keeping the intermediate tensors that `stages` asks for.
     pub fn forward_stages(&self, batch: &ClipBatch, stages: &mut Stages) -> Result<ClipOutput, ModelError> {
+        self.run(batch, &Shortcuts::default(), stages)
+    }
+
+    fn run(&self, batch: &ClipBatch, shortcuts: &Shortcuts, stages: &mut Stages) -> Result<ClipOutput, ModelError> {
         let config = &*self.config;
-        let dims @ [_, _, v, h, w] = batch.dims()?;
+        let [b, timesteps, v, h, w] = batch.dims()?;
         self.check_sizes(v, h, w)?;
+        let (rows, cols) = (h / config.patch_size, w / config.patch_size);
+        let grid = Grid { timesteps, cameras: v, rows, cols };
+        shortcuts.check(grid.patches())?;
         let rays = Rays::new(config, batch)?;
         stages.keep("ray_directions", &rays.directions);
         stages.keep("plucker", &rays.plucker);
         let image_tokens = self.embed.forward(batch, &rays, stages)?;
         let tokens = self.with_extra_tokens(image_tokens, v)?;
         stages.keep("tokens_in", &tokens);
-        let tokens = self.transformer.forward(tokens, stages)?;
+        let activity = match shortcuts.merge > 0.0 {
+            true => Some(tokens::activity(&batch.image.get(0)?, config.patch_size)?),
+            false => None,
+        };
+        let extra = tokens.dim(1)? - grid.patches();
+        let plan = TokenPlan::new(shortcuts, grid, extra, activity.as_deref());
+        let tokens = self.transformer.forward(tokens, &plan, shortcuts.precision, stages)?;
 
+        // From here on only the timesteps that come out.
+        let newest = (shortcuts.newest_only && timesteps > 1).then_some(timesteps - 1);
+        let (image, time_sec, rays) = match newest {
+            Some(t) => (batch.image.narrow(1, t, 1)?, batch.time_sec.narrow(1, t, 1)?, rays.timestep(t)?),
+            None => (batch.image.clone(), batch.time_sec.clone(), rays),
+        };
+        let dims = [b, image.dim(1)?, v, h, w];
         let (mut at, d) = (0, config.embed_dim);
         let mut take = |count: usize| {
             at += count;
@@ -133,13 +171,12 @@ impl Storm {
             None => None,
         };
         let motion_tokens = if self.motion_tokens.is_some() { Some(take(config.num_motion_tokens)?) } else { None };
-        let patches = (h / config.patch_size) * (w / config.patch_size);
-        let image_tokens = take(dims[1] * v * patches)?;
+        let image_tokens = take(dims[1] * v * rows * cols)?;
         debug_assert_eq!(image_tokens.dims()[2], d);
 
-        let gaussians = self.gaussians.forward(config, &image_tokens, &batch.image, &rays, stages)?;
+        let gaussians = self.gaussians.forward(config, &image_tokens, &image, &rays, stages)?;
         let motion = self.motion.forward(config, &image_tokens, motion_tokens.as_ref(), dims, stages)?;
-        Ok(ClipOutput {
+        let mut output = ClipOutput {
             means: gaussians.means,
             scales: gaussians.scales,
             quats: gaussians.quats,
@@ -152,10 +189,14 @@ impl Storm {
             motion_bases: motion.bases,
             affine,
             sky_token,
-            time_sec: batch.time_sec.clone(),
+            time_sec,
             config: Arc::clone(&self.config),
             sky: self.sky.clone(),
-        })
+        };
+        if let Some(keep) = &shortcuts.keep {
+            output.hide(keep, grid)?;
+        }
+        Ok(output)
     }
 
     /// The position embedding on a patch grid, `(1, rows * cols, embed_dim)`; none when the network has none.

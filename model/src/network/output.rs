@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use storm_render::Gaussians;
 
 use super::sky::SkyHead;
+use super::tokens::Grid;
 use crate::config::{AffineKind, ModelConfig};
 use crate::error::ModelError;
 use crate::kernels::tensors::with_values;
@@ -68,6 +69,57 @@ impl ClipOutput {
                 colors.contiguous()?.matmul(&matrix)?.broadcast_add(&bias)?
             }
         })
+    }
+
+    /// Several windows' outputs as one batch.
+    pub(super) fn stack(each: &[Self]) -> Result<Self, ModelError> {
+        let Some(first) = each.first() else { return Err(ModelError::Input("no windows to stack".into())) };
+        let cat = |pick: fn(&Self) -> &Tensor| Tensor::cat(&each.iter().map(pick).collect::<Vec<_>>(), 0);
+        let some = |pick: fn(&Self) -> Option<&Tensor>| {
+            let all: Option<Vec<&Tensor>> = each.iter().map(pick).collect();
+            all.map(|all| Tensor::cat(&all, 0)).transpose()
+        };
+        Ok(Self {
+            means: cat(|o| &o.means)?,
+            scales: cat(|o| &o.scales)?,
+            quats: cat(|o| &o.quats)?,
+            opacities: cat(|o| &o.opacities)?,
+            colors: cat(|o| &o.colors)?,
+            depths: cat(|o| &o.depths)?,
+            velocity_backward: cat(|o| &o.velocity_backward)?,
+            velocity_forward: cat(|o| &o.velocity_forward)?,
+            motion_weights: some(|o| o.motion_weights.as_ref())?,
+            motion_bases: some(|o| o.motion_bases.as_ref())?,
+            affine: some(|o| o.affine.as_ref())?,
+            sky_token: some(|o| o.sky_token.as_ref())?,
+            time_sec: cat(|o| &o.time_sec)?,
+            config: Arc::clone(&first.config),
+            sky: first.sky.clone(),
+        })
+    }
+
+    /// Makes the pixels of patches that were not computed transparent and still. `keep` is of all the window's timesteps, of
+    /// which the output may have the last ones.
+    pub(super) fn hide(&mut self, keep: &[bool], grid: Grid) -> Result<(), ModelError> {
+        let &[_, t, v, h, w] = self.opacities.dims() else {
+            return Err(ModelError::Input("opacities are not (b, t, v, h, w)".into()));
+        };
+        let (down, across) = (h / grid.rows, w / grid.cols);
+        let first = (grid.timesteps - t) * v;
+        let pixels: Vec<f32> = (0..t * v * h * w)
+            .map(|i| {
+                let (picture, row, col) = (first + i / (h * w), i / w % h, i % w);
+                let patch = (picture * grid.rows + row / down) * grid.cols + col / across;
+                if keep.get(patch).copied().unwrap_or(true) { 1.0 } else { 0.0 }
+            })
+            .collect();
+        let mask =
+            Tensor::from_vec(pixels, (1, t, v, h, w), self.opacities.device())?.to_dtype(self.opacities.dtype())?;
+        self.opacities = self.opacities.broadcast_mul(&mask)?;
+        let mask = mask.unsqueeze(D::Minus1)?;
+        self.velocity_backward = self.velocity_backward.broadcast_mul(&mask)?;
+        self.velocity_forward = self.velocity_forward.broadcast_mul(&mask)?;
+        Ok(())
     }
 
     /// Window `index` of the batch as plain numbers, ready to render or publish.

@@ -1,17 +1,22 @@
 //! The transformer: pre-norm blocks with full attention over all tokens of a window.
 
+use std::sync::{Arc, OnceLock};
+
 use candle_core::Tensor;
 
 use super::params::{Norm, Params};
 use super::stages::Stages;
+use super::tokens::{Groups, TokenPlan, select};
 use crate::config::ModelConfig;
 use crate::error::ModelError;
-use crate::ops::{Activation, Linear, Step, attention, chain, linear};
+use crate::ops::{Activation, Linear, Precision, Step, attention_at, chain, cross_attention, linear};
 
 #[derive(Debug, Clone)]
 struct Block {
     norm1: Norm,
     qkv: Linear,
+    /// Its two parts, queries and keys with values, made when they are first taken apart.
+    split: Arc<OnceLock<(Linear, Linear)>>,
     proj: Linear,
     norm2: Norm,
     fc1: Linear,
@@ -33,6 +38,7 @@ impl Transformer {
             Ok::<_, ModelError>(Block {
                 norm1: params.norm(&format!("{name}.norm1"))?,
                 qkv: params.linear(&format!("{name}.attn.qkv"))?,
+                split: Arc::default(),
                 proj: params.linear(&format!("{name}.attn.proj"))?,
                 norm2: params.norm(&format!("{name}.norm2"))?,
                 fc1: params.linear(&format!("{name}.mlp.fc1"))?,
@@ -43,11 +49,27 @@ impl Transformer {
         Ok(Self { blocks, norm: params.norm("norm")?, heads: config.num_heads })
     }
 
-    /// `(b, n, d)` to `(b, n, d)`.
-    pub fn forward(&self, tokens: Tensor, stages: &mut Stages) -> Result<Tensor, ModelError> {
-        let mut x = tokens;
+    /// `(b, n, d)` to `(b, n, d)`, products in `precision`; as many tokens as the plan puts out.
+    pub fn forward(
+        &self,
+        tokens: Tensor,
+        plan: &TokenPlan,
+        precision: Precision,
+        stages: &mut Stages,
+    ) -> Result<Tensor, ModelError> {
+        let entered = plan.enter(tokens)?;
+        let mut x = entered.tokens.clone();
         for (k, block) in self.blocks.iter().enumerate() {
-            x = block.forward(&x, self.heads, &mut |part, tensor| {
+            let last = k + 1 == self.blocks.len();
+            let pooled = plan.pooled.as_ref().filter(|_| k > 0 && !last);
+            let look = Look {
+                heads: self.heads,
+                precision,
+                pooled,
+                sizes: pooled.map(|groups| &groups.sizes[..]).or(plan.sizes()),
+                queries: plan.last_queries.as_deref().filter(|_| last),
+            };
+            x = block.forward(&x, &look, &mut |part, tensor| {
                 let name = format!("block_{k}.{part}");
                 if stages.wants(&name) {
                     stages.keep(&name, &tensor()?);
@@ -56,7 +78,7 @@ impl Transformer {
             })?;
             stages.keep(&format!("block_{k}"), &x);
         }
-        let x = self.norm.forward(&x)?;
+        let x = self.norm.forward(&plan.finish(x, &entered)?)?;
         stages.keep("tokens_norm", &x);
         Ok(x)
     }
@@ -65,22 +87,83 @@ impl Transformer {
 /// Takes what is only computed when it is kept.
 type Probe<'a> = dyn FnMut(&str, &dyn Fn() -> candle_core::Result<Tensor>) -> candle_core::Result<()> + 'a;
 
+/// How a block looks at its tokens.
+struct Look<'a> {
+    heads: usize,
+    precision: Precision,
+    /// Keys and values that are taken as one.
+    pooled: Option<&'a Groups>,
+    /// Patches each key stands for; none: one.
+    sizes: Option<&'a [f32]>,
+    /// Tokens that are worked out; none: all.
+    queries: Option<&'a [u32]>,
+}
+
 impl Block {
-    fn forward(&self, x: &Tensor, heads: usize, probe: &mut Probe<'_>) -> candle_core::Result<Tensor> {
+    fn forward(&self, x: &Tensor, look: &Look<'_>, probe: &mut Probe<'_>) -> candle_core::Result<Tensor> {
         probe("norm1", &|| self.norm1.forward(x))?;
-        let qkv = chain(x, &[self.norm1.step(Activation::None), Step::Linear(&self.qkv, Activation::None)], None)?;
-        probe("attn.qkv", &|| Ok(qkv.clone()))?;
-        let attended = linear(&attention(&qkv, heads)?, &self.proj, Activation::None, Some(x))?;
-        drop(qkv);
-        probe("attn", &|| &attended - x)?;
+        let precision = look.precision;
+        let proj = self.proj.at(precision);
+        let attended = if look.sizes.is_none() && look.queries.is_none() {
+            let qkv = self.qkv.at(precision);
+            let qkv = chain(x, &[self.norm1.step(Activation::None), Step::Linear(&qkv, Activation::None)], None)?;
+            probe("attn.qkv", &|| Ok(qkv.clone()))?;
+            let attended = attention_at(&qkv, look.heads, precision)?;
+            drop(qkv);
+            linear(&attended, &proj, Activation::None, Some(x))?
+        } else {
+            self.attend_apart(x, look, &proj)?
+        };
+        // Where not all are queries there are fewer rows than in `x`.
+        if look.queries.is_none() {
+            probe("attn", &|| &attended - x)?;
+        }
         probe("norm2", &|| self.norm2.forward(&attended))?;
+        let (fc1, fc2) = (self.fc1.at(precision), self.fc2.at(precision));
         let steps = [
             self.norm2.step(Activation::None),
-            Step::Linear(&self.fc1, Activation::Gelu),
-            Step::Linear(&self.fc2, Activation::None),
+            Step::Linear(&fc1, Activation::Gelu),
+            Step::Linear(&fc2, Activation::None),
         ];
         let out = chain(&attended, &steps, Some(&attended))?;
         probe("mlp", &|| &out - &attended)?;
         Ok(out)
+    }
+
+    /// Attention whose queries are not its keys, added to the queries' tokens.
+    fn attend_apart(&self, x: &Tensor, look: &Look<'_>, proj: &Linear) -> candle_core::Result<Tensor> {
+        let (query, key_value) = self.split()?;
+        let (query, key_value) = (query.at(look.precision), key_value.at(look.precision));
+        let normed = self.norm1.forward(x)?;
+        // The layer is affine: keys of a mean are the mean of the keys.
+        let keys_values = match look.pooled {
+            Some(groups) => linear(&groups.mean(&normed)?, &key_value, Activation::None, None)?,
+            None => linear(&normed, &key_value, Activation::None, None)?,
+        };
+        let (normed, x) = match look.queries {
+            Some(rows) => (select(&normed, rows)?, select(x, rows)?),
+            None => (normed, x.clone()),
+        };
+        let queries = linear(&normed, &query, Activation::None, None)?;
+        let attended = cross_attention(&queries, &keys_values, look.sizes, look.heads, look.precision)?;
+        linear(&attended, proj, Activation::None, Some(&x))
+    }
+
+    /// The query layer and that of keys with values.
+    fn split(&self) -> candle_core::Result<(Linear, Linear)> {
+        let part = |first: usize, count: usize| {
+            let bias = self.qkv.bias.as_ref().map(|bias| bias.narrow(0, first, count)).transpose()?;
+            Ok::<_, candle_core::Error>(Linear::new(self.qkv.weight.narrow(0, first, count)?.contiguous()?, bias))
+        };
+        let d = self.qkv.weight.dim(0)? / 3;
+        let make = || Ok::<_, candle_core::Error>((part(0, d)?, part(d, 2 * d)?));
+        if self.qkv.weight.track_op() {
+            return make();
+        }
+        if let Some(both) = self.split.get() {
+            return Ok(both.clone());
+        }
+        let both = make()?;
+        Ok(self.split.get_or_init(|| both).clone())
     }
 }

@@ -37,6 +37,9 @@ pub struct Args {
     /// Configuration file, for the bag's topics and windows.
     #[arg(long, requires = "bag")]
     config: Option<PathBuf>,
+    /// Set one configuration key, e.g. --set model.precision=int8 or --set skip.kv_pool=2; repeatable.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
     /// Weights: .safetensors, or a PyTorch .pth/.pt checkpoint [default: those that ship].
     #[arg(long, default_value = "", hide_default_value = true)]
     weights: String,
@@ -71,10 +74,7 @@ fn parse_seeds(text: &str) -> Result<std::ops::Range<u64>, String> {
 
 /// Scores the network and what it is compared with, prints the table.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
-    let mut config = match &args.config {
-        Some(path) => Config::load(path)?,
-        None => Config::default(),
-    };
+    let mut config = Config::from_arguments(args.config.as_deref(), &args.set)?;
     if !args.weights.is_empty() {
         config.model.weights = args.weights.clone();
     }
@@ -87,7 +87,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let data = Data::open(args, &config, size)?;
     let cameras = data.cameras();
     let timespan_sec = config.window.timespan_sec;
-    let engine = Engine::new(source, &config.model, cameras, timespan_sec)?;
+    let engine = Engine::new(source, &config.model, cameras, timespan_sec)?.with_skips(&config.skip);
     let per_frame = args.per_frame_weights.as_deref().map(|path| {
         let section = ModelConfigSection { weights: path.display().to_string(), ..config.model.clone() };
         let source = ModelSource::open(&section)?;

@@ -96,6 +96,8 @@ section! {
         image_height: usize = 0,
         /// Threads for the network and the rasteriser; 0: all cores.
         threads: usize = 0,
+        /// Numbers of the transformer's products: `f32`, `bf16` (faster only on processors that have it), `int8` (integer products with exact sums; CPU).
+        precision: String = "f32".into(),
     }
 }
 
@@ -114,14 +116,38 @@ section! {
         still_sigmas: f64 = 6.0,
         /// and by more than this many 8-bit levels.
         still_levels: f64 = 1.5,
-        /// After this many skipped steps one is computed all the same and compared; 0: nothing is skipped.
-        check_every: usize = 50,
-        /// Most PSNR a skipped step may lose against the computed one, dB; beyond it checks come twice as often, down to no skipping.
+        /// A window that the last computed Gaussians, moved by their velocities, explain in every patch of the newest pictures takes them, extrapolated.
+        predict: bool = false,
+        /// Farthest ahead of the last computed step, seconds.
+        predict_sec: f64 = 0.5,
+        /// Farthest a camera may have moved since, metres.
+        predict_m: f64 = 10.0,
+        /// And turned, degrees.
+        predict_deg: f64 = 10.0,
+        /// A patch is unexplained when picture less prediction has changed by more than noise, by more than this many 8-bit levels,
+        predict_levels: f64 = 4.0,
+        /// and by more than the picture changes within this many pixels.
+        predict_px: f64 = 1.0,
+        /// After this many skipped or approximated steps one is computed in full all the same and compared; 0: nothing is skipped.
+        check_every: usize = 100,
+        /// Most PSNR such a step may lose against the full one, dB; beyond it the level goes down a notch until a check holds again.
         max_psnr_loss_db: f64 = 0.1,
         /// Largest difference of velocities, as a part of the speeds seen.
         max_flow_change: f64 = 0.02,
         /// Largest part of the moving pixels in which the two differ.
         max_mask_change: f64 = 0.01,
+        /// In the middle blocks the keys and values of so many times so many patches of a picture are taken as one, 1 to 4; 1: off.
+        kv_pool: usize = 1,
+        /// Part of the image tokens merged into a neighbour of the same picture, 0 to 0.75; edges and what moves are kept longest. 0: off.
+        merge: f64 = 0.0,
+        /// The last block and the heads work on the newest timestep alone: the map, flow and masks get that timestep's Gaussians only.
+        newest_only: bool = false,
+        /// Patches that were sky in the last step, far from anything else, and have not changed are not computed.
+        sky: bool = false,
+        /// A patch is sky when no pixel of it was more opaque than this.
+        sky_opacity: f64 = 0.05,
+        /// After this many steps with patches left out, all are computed.
+        sky_every: usize = 10,
     }
 }
 

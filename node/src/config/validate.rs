@@ -1,5 +1,8 @@
 //! Which values are accepted.
 
+use storm_model::Precision;
+use storm_model::network::{MAX_KV_POOL, MAX_MERGE};
+
 use super::{Config, ConfigError};
 
 impl Config {
@@ -24,10 +27,19 @@ impl Config {
         between("skip.still_sec", self.skip.still_sec, 0.0, 1.0)?;
         between("skip.still_sigmas", self.skip.still_sigmas, 1.0, 100.0)?;
         between("skip.still_levels", self.skip.still_levels, 0.0, 255.0)?;
+        between("skip.predict_sec", self.skip.predict_sec, 0.0, 60.0)?;
+        between("skip.predict_m", self.skip.predict_m, 0.0, 1000.0)?;
+        between("skip.predict_deg", self.skip.predict_deg, 0.0, 180.0)?;
+        between("skip.predict_levels", self.skip.predict_levels, 0.0, 255.0)?;
+        between("skip.predict_px", self.skip.predict_px, 0.0, 10.0)?;
         count("skip.check_every", self.skip.check_every, 0, 1_000_000)?;
         between("skip.max_psnr_loss_db", self.skip.max_psnr_loss_db, 0.0, 100.0)?;
         between("skip.max_flow_change", self.skip.max_flow_change, 0.0, 100.0)?;
         between("skip.max_mask_change", self.skip.max_mask_change, 0.0, 1.0)?;
+        count("skip.kv_pool", self.skip.kv_pool, 1, MAX_KV_POOL)?;
+        between("skip.merge", self.skip.merge, 0.0, f64::from(MAX_MERGE))?;
+        between("skip.sky_opacity", self.skip.sky_opacity, 0.0, 1.0)?;
+        count("skip.sky_every", self.skip.sky_every, 0, 1_000_000)?;
         between("overlap.depth_gate", self.overlap.depth_gate, 0.0, 1.0)?;
         between("overlap.max_color_step", self.overlap.max_color_step, 0.0, 1.0)?;
         between("map.tile_m", self.map.tile_m, 1.0, 1000.0)?;
@@ -75,6 +87,7 @@ impl Config {
         one_of("live.map", &self.live.map, &["auto", "always", "never"])?;
         one_of("live.reliability", &self.live.reliability, &["sensor_data", "reliable"])?;
         one_of("input.rectified", &self.input.rectified, &["auto", "yes", "no"])?;
+        one_of("model.precision", &self.model.precision, &Precision::ALL.map(|(_, name)| name))?;
         one_of("model.device", &self.model.device, &["cpu", "cuda", "metal"])?;
         for x in &self.input.image_time_offset_sec {
             between("input.image_time_offset_sec", *x, -60.0, 60.0)?;

@@ -15,11 +15,11 @@ use candle_core::Device;
 use storm_model::config::ModelConfig;
 use storm_model::scene::{RenderedView, Scene, Want};
 use storm_model::weights::{self, Tensors};
-use storm_model::{ClipBatch, PixelLayout, Storm, ViewInput};
+use storm_model::{ClipBatch, PixelLayout, Shortcuts, Storm, ViewInput};
 use storm_render::raster::{CpuRasterizer, RasterSettings};
 use storm_render::{Intrinsics, View};
 
-use crate::config::ModelConfigSection;
+use crate::config::{ModelConfigSection, SkipConfig};
 use crate::rigid::Rigid;
 use crate::source::Frame;
 use crate::window::{PosedSet, Window, relative};
@@ -111,6 +111,7 @@ pub struct Engine {
     device: Device,
     timespan_sec: f64,
     weights: String,
+    shortcuts: Shortcuts,
 }
 
 impl Engine {
@@ -130,7 +131,27 @@ impl Engine {
             }
         };
         let raster = CpuRasterizer::new(model.config().raster_settings())?;
-        Ok(Self { model, raster, device, timespan_sec, weights })
+        let shortcuts = Shortcuts { precision: section.precision.parse()?, ..Shortcuts::default() };
+        Ok(Self { model, raster, device, timespan_sec, weights, shortcuts })
+    }
+
+    /// The same, leaving out what the configuration allows.
+    #[must_use]
+    pub fn with_skips(mut self, skip: &SkipConfig) -> Self {
+        self.shortcuts.kv_pool = skip.kv_pool;
+        self.shortcuts.merge = skip.merge as f32;
+        self.shortcuts.newest_only = skip.newest_only;
+        self
+    }
+
+    /// What the next steps leave out or round. A `keep` is set for each step anew.
+    pub fn set_shortcuts(&mut self, shortcuts: Shortcuts) {
+        self.shortcuts = shortcuts;
+    }
+
+    /// What steps leave out or round at present.
+    pub fn shortcuts(&self) -> &Shortcuts {
+        &self.shortcuts
     }
 
     /// The network's configuration.
@@ -154,6 +175,14 @@ impl Engine {
         scenes.pop().context("the network gave no scene")?
     }
 
+    /// The same, leaving nothing out and rounding nothing.
+    pub fn exact_step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
+        let shortcuts = std::mem::take(&mut self.shortcuts);
+        let scene = self.step(window, cameras);
+        self.shortcuts = shortcuts;
+        scene
+    }
+
     /// Runs the network on several windows in one forward pass. One result per window: a window whose result is not
     /// finite does not spoil the others.
     ///
@@ -163,8 +192,8 @@ impl Engine {
         let clips = windows.iter().map(|w| self.clip(w, cameras)).collect::<Result<Vec<_>>>()?;
         let output = match clips.as_slice() {
             [] => return Ok(Vec::new()),
-            [one] => self.model.forward(one)?,
-            several => self.model.forward(&ClipBatch::stack(several)?)?,
+            [one] => self.model.forward_with(one, &self.shortcuts)?,
+            several => self.model.forward_with(&ClipBatch::stack(several)?, &self.shortcuts)?,
         };
         Ok((0..clips.len()).map(|i| Ok(output.scene(i)?)).collect())
     }

@@ -17,6 +17,8 @@ const MOST_SIGMA: f32 = 8.0;
 /// A pixel alone has to stand out so much more than a patch: there are many, and compression makes them jump.
 const PIXEL_SIGMAS_FACTOR: f32 = 1.5;
 const PIXEL_LEVELS_FACTOR: f32 = 5.0;
+/// What is allowed a patch in the mean, a single pixel of it may exceed by this factor.
+const PIXEL_SLACK_FACTOR: f32 = 2.0;
 
 /// What counts as change.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,10 +56,23 @@ pub fn first_change(a: &RgbPicture, b: &RgbPicture, sensitivity: Sensitivity) ->
         .zip(b.data.chunks_exact(3))
         .map(|(a, b)| (0..3).map(|c| i16::from(b[c]) - i16::from(a[c])).sum())
         .collect();
-    let sigma = noise(&d, w).clamp(LEAST_SIGMA * 3f32.sqrt(), MOST_SIGMA * 3f32.sqrt());
+    first_beyond(&d, None, (w, h), sensitivity)
+}
+
+/// The first place where `d`, differences summed over the three channels of a picture of this width and height, is beyond noise;
+/// `slack`, per pixel and summed likewise, is allowed on top.
+pub(super) fn first_beyond(
+    d: &[i16],
+    slack: Option<&[f32]>,
+    (w, h): (usize, usize),
+    sensitivity: Sensitivity,
+) -> Option<Change> {
+    let slack = |i: usize| slack.map_or(0.0, |s| s[i]);
+    let sigma = noise(d, w).clamp(LEAST_SIGMA * 3f32.sqrt(), MOST_SIGMA * 3f32.sqrt());
     let pixel_limit =
         (PIXEL_SIGMAS_FACTOR * sensitivity.sigmas * sigma).max(PIXEL_LEVELS_FACTOR * 3.0 * sensitivity.levels);
-    if let Some(i) = d.iter().position(|&x| f32::from(x).abs() > pixel_limit) {
+    let stands_out = |(i, x): (usize, &i16)| f32::from(*x).abs() > pixel_limit + PIXEL_SLACK_FACTOR * slack(i);
+    if let Some(i) = d.iter().enumerate().position(stands_out) {
         return Some(Change { at: [i % w, i / w], levels: f32::from(d[i]) / 3.0 });
     }
     let pixels = (PATCH * PATCH) as f32;
@@ -65,11 +80,16 @@ pub fn first_change(a: &RgbPicture, b: &RgbPicture, sensitivity: Sensitivity) ->
     let starts = |size: usize| (0..=size.saturating_sub(PATCH)).step_by(STRIDE);
     for y in starts(h) {
         for x in starts(w) {
-            let rows = (y..(y + PATCH).min(h)).map(|row| &d[row * w + x..row * w + (x + PATCH).min(w)]);
-            let (sum, count) = rows
-                .fold((0i32, 0), |(sum, n), row| (sum + row.iter().map(|&x| i32::from(x)).sum::<i32>(), n + row.len()));
-            let mean = sum as f32 / count.max(1) as f32;
-            if mean.abs() > limit {
+            let (mut sum, mut allowed, mut count) = (0i32, 0.0, 0usize);
+            for row in y..(y + PATCH).min(h) {
+                for i in row * w + x..row * w + (x + PATCH).min(w) {
+                    sum += i32::from(d[i]);
+                    allowed += slack(i);
+                    count += 1;
+                }
+            }
+            let (mean, allowed) = (sum as f32 / count.max(1) as f32, allowed / count.max(1) as f32);
+            if mean.abs() > limit + allowed {
                 return Some(Change { at: [x, y], levels: mean / 3.0 });
             }
         }

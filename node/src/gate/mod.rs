@@ -2,11 +2,16 @@
 //!
 //! A vehicle that waits at a light sees the same four timesteps again and again. The new window is compared with the one last
 //! computed, timestep by timestep and camera by camera: same place, same picture up to noise, so same input, so same result.
+//! Where something moves, the last result may still explain the new pictures once it is moved on ([`predict`]). What is skipped
+//! in either way is checked against full steps by the [`contract`], and the ladder of notches ([`skipper`]) goes down where it
+//! is broken.
+//!
 //! Comparing with the last *computed* window and not with the last frame means that slow changes add up until they are seen;
 //! comparing all timesteps means that a car that has just stopped goes on being computed until no timestep shows it moving.
 
 pub mod change;
 pub mod contract;
+pub mod predict;
 pub mod skipper;
 
 use crate::config::SkipConfig;
@@ -83,6 +88,11 @@ pub fn same(config: &SkipConfig, computed: &Window<Frame>, new: &Window<Frame>) 
 
 trait Angle {
     fn angle_to_identity(&self) -> f64;
+}
+
+/// Mean of differences, 0 of none.
+fn pictures_mean(d: &[i16]) -> f32 {
+    d.iter().map(|&x| i64::from(x)).sum::<i64>() as f32 / d.len().max(1) as f32
 }
 
 impl Angle for glam::DQuat {

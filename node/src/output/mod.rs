@@ -8,6 +8,7 @@ pub mod cloud_live;
 pub mod error;
 pub mod objects_csv;
 pub mod picture;
+pub mod plot;
 pub mod ply;
 pub mod qos;
 pub mod report;

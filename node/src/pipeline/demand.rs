@@ -19,9 +19,13 @@ impl Demand {
     /// Everything.
     pub const ALL: Self = Self { motion: true, tracks: true, objects: true, map: true, pictures: true };
 
+    /// Whether the newest cameras' views are drawn for it.
+    pub fn drawn(&self) -> bool {
+        self.pictures || self.map
+    }
+
     /// Whether what was worked out for this is enough for `other`; trajectories and objects are followed anew either way.
     pub fn covers(&self, other: Self) -> bool {
-        let pictures = self.pictures || self.map;
-        (self.motion || !other.motion) && (pictures || !other.pictures) && (self.map || !other.map)
+        (self.motion || !other.motion) && (self.drawn() || !other.pictures) && (self.map || !other.map)
     }
 }

@@ -6,6 +6,7 @@ use storm_model::scene::{Affine, RenderedView};
 
 use crate::config::Config;
 use crate::engine::select;
+use crate::gate::predict::PixelFlow;
 use crate::map::{TileIndex, color01};
 use crate::msg::{CameraInfo, Header, Image, Path, PointCloud2, PoseStamped, TransformStamped};
 use crate::output::OutputError;
@@ -91,12 +92,17 @@ pub fn gaussians(step: &Step, config: &Config, counts: &mut Published) -> Result
 /// One point per pixel of the newest pictures, cameras stacked: where the surface is and how it moves.
 pub fn flow(step: &Step, counts: &mut Published) -> Result<PointCloud2, OutputError> {
     let (shape, g) = (&step.scene.shape, &step.scene.gaussians);
+    let (width, height) = (shape.width, shape.cameras * shape.height);
+    if let Some(PixelFlow { positions, velocities, valid }) = &step.pixels {
+        let cloud = FlowCloud { width, height, positions, velocities, valid };
+        return Ok(counts.counted(flow_cloud(anchor_header(step), &cloud)?));
+    }
     let range = select::from_step(&step.scene, shape.timesteps - 1);
     // A pixel that its own Gaussian hardly covers shows the sky.
     let valid: Vec<bool> = g.opacities[range.clone()].iter().map(|&o| o >= select::SURFACE_OPACITY).collect();
     let cloud = FlowCloud {
-        width: shape.width,
-        height: shape.cameras * shape.height,
+        width,
+        height,
         positions: &g.means[range.clone()],
         velocities: &g.velocity_forward[range],
         valid: &valid,

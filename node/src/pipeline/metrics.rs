@@ -62,9 +62,9 @@ pub struct Metrics {
     pub frames_in: u64,
     /// Steps run.
     pub steps: u64,
-    /// Steps among them that were not computed because the scene did not need it.
+    /// Steps among them that the network was not run for because the scene did not need it.
     pub steps_skipped: u64,
-    /// How skipped steps were checked.
+    /// By which notch of the ladder, how they were checked, and the present level.
     pub skips: SkipCounts,
     /// Images dropped, by reason; every reason is listed.
     pub dropped: BTreeMap<String, u64>,

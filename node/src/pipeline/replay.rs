@@ -59,7 +59,8 @@ pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
     let size = model.picture_size(&config.model)?;
     let source = BagSource::open(&options.bag, config, size)?;
     let rig = source.rig();
-    let engine = Engine::new(model, &config.model, rig.cameras.len(), config.window.timespan_sec)?;
+    let engine =
+        Engine::new(model, &config.model, rig.cameras.len(), config.window.timespan_sec)?.with_skips(&config.skip);
     if engine.weights() == UNTRAINED {
         warn!(
             "weights: untrained. Seeded random weights stand in; the results show the plumbing, not a reconstruction"

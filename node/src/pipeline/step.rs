@@ -1,23 +1,28 @@
 //! One step: a window through the network, its pictures, and what it adds to the map and the trajectories.
 
+use std::collections::VecDeque;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
-use storm_model::ModelError;
+use glam::Quat;
 use storm_model::scene::{RenderedView, Scene, Want};
+use storm_model::{ModelError, Shortcuts};
 use storm_render::Intrinsics;
-use tracing::warn;
+use tracing::{debug, warn};
 
 use crate::config::Config;
 use crate::engine::{Engine, select, views_of};
-use crate::gate::skipper::{Computed, Plan, SkipCounts, Skipper};
+use crate::gate::contract::{Difference, Notch, Verdict};
+use crate::gate::predict::{PixelFlow, explains, moved_on, pixel_flow};
+use crate::gate::skipper::{Computed, Plan, Shadow, SkipCounts, Skipper, UNLIKE, difference};
 use crate::map::{MapError, SceneLook, StaticMap};
 use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
 use crate::overlap::{Agreement, Overlap, OverlapCounts, OverlapLook};
 use crate::rigid::Rigid;
 use crate::source::Frame;
+use crate::sync::clock::seconds_between;
 use crate::tracks::{Track, TrackCounts, Tracker};
 use crate::window::Window;
 
@@ -27,6 +32,8 @@ use super::timing::Timings;
 /// A surface the map has seen at one place for this long stands, whatever a network under fast ego motion says of its
 /// speed: nothing that moves at a gate of 1 m/s stays in a voxel that long.
 const STANDS_SEC: f64 = 1.0;
+/// Stamps remembered of sets the map was given: those of a window's length at 100 Hz.
+const FUSED_KEPT: usize = 512;
 
 /// What one step gives.
 pub struct Step {
@@ -40,6 +47,11 @@ pub struct Step {
     pub views: Arc<[RenderedView]>,
     /// How far this window and earlier ones agree about its Gaussians.
     pub agreement: Arc<Agreement>,
+    /// The notch that took it, where it was not computed in full.
+    pub notch: Option<Notch>,
+    /// What the newest pictures' pixels show, where the newest timestep's Gaussians are not aligned with them: an extrapolated
+    /// step's belong to the pixels of the last computed one.
+    pub pixels: Option<PixelFlow>,
     /// Milliseconds from window to here.
     pub total_ms: f64,
 }
@@ -65,8 +77,24 @@ pub struct StepMaker {
     overlap: Overlap,
     skipper: Skipper,
     timings: Timings,
+    /// Stamps of sets the map was given at their newest; no more than a window holds.
+    fused: VecDeque<i64>,
     steps: u64,
     non_finite: u64,
+}
+
+/// A prediction of a window from the last computed one.
+struct Predicted {
+    /// The new window, in the computed one's anchor.
+    window: Window<Frame>,
+    views: Vec<RenderedView>,
+}
+
+/// What the network said of a window, and how long it took.
+struct Ran {
+    scene: Result<Scene>,
+    ms: f64,
+    approximate: bool,
 }
 
 impl StepMaker {
@@ -97,6 +125,7 @@ impl StepMaker {
             skipper: Skipper::new(&config.skip),
             config: config.clone(),
             timings: Timings::default(),
+            fused: VecDeque::new(),
             steps: 0,
             non_finite: 0,
         })
@@ -144,11 +173,6 @@ impl StepMaker {
         self.skipper.counts()
     }
 
-    /// Skips allowed between two checks at present; 0: none.
-    pub fn skip_level(&self) -> u64 {
-        self.skipper.level()
-    }
-
     /// The network, for what it says of itself.
     pub fn engine(&self) -> &Engine {
         &self.engine
@@ -159,21 +183,103 @@ impl StepMaker {
         self.run_for(window, Demand::ALL)
     }
 
-    /// The same, with no more than `demand` asks for. A window that shows what the last computed one showed takes its result
-    /// (see [`crate::gate`]).
+    /// The same, with no more than `demand` asks for. A window that shows what the last computed one showed takes its result, one
+    /// that it explains once moved on takes it extrapolated (see [`crate::gate`]).
     pub fn run_for(&mut self, window: Window<Frame>, demand: Demand) -> Result<Option<Step>> {
         let plan = self.timings.time("gate", || self.skipper.plan(&window, demand));
-        let check = match plan {
+        let shadow = match plan {
             Plan::Reuse(again) => return Ok(Some(self.again(window, again, demand))),
-            Plan::Compute { check } => check,
+            Plan::Predict(last) => match self.predict(&window, &last, demand) {
+                None => {
+                    self.skipper.unexplained();
+                    None
+                }
+                Some(predicted) => match self.skipper.explained() {
+                    Verdict::Skip => return Ok(Some(self.extrapolated(predicted, &last, demand))),
+                    Verdict::Check => Some(Shadow {
+                        notch: Notch::Predicted,
+                        approximate: last.approximate,
+                        scene: last.scene,
+                        views: predicted.views.into(),
+                        map_from_anchor: last.window.map_from_anchor.rotation,
+                    }),
+                    Verdict::Full => None,
+                },
+            },
+            Plan::Compute { shadow } => shadow,
         };
         let start = Instant::now();
-        let scene = self.engine.step(&window, &self.cameras);
-        self.take_in(window, scene, start.elapsed().as_secs_f64() * 1e3, demand, check)
+        // What a skipped step is compared with leaves nothing out.
+        let verdict = match shadow {
+            None if !self.engine.shortcuts().exact() => self.skipper.may_approximate(),
+            _ => Verdict::Full,
+        };
+        if verdict == Verdict::Skip {
+            let scene = self.engine.step(&window, &self.cameras);
+            let ran = Ran { scene, ms: start.elapsed().as_secs_f64() * 1e3, approximate: true };
+            return self.take_in(window, ran, demand, None);
+        }
+        let scene = self.engine.exact_step(&window, &self.cameras);
+        let ran = Ran { scene, ms: start.elapsed().as_secs_f64() * 1e3, approximate: false };
+        if let (Verdict::Check, Ok(exact)) = (verdict, &ran.scene) {
+            let found = self.approximation(&window, exact)?;
+            self.skipper.approximated(found);
+        }
+        self.take_in(window, ran, demand, shadow.as_ref())
+    }
+
+    /// The window with the configured approximations, in the shadow of the exact step: how the two compare.
+    fn approximation(&mut self, window: &Window<Frame>, exact: &Scene) -> Result<Difference> {
+        let start = Instant::now();
+        let Ok(rough) = self.engine.step(window, &self.cameras) else { return Ok(UNLIKE) };
+        let newest = &window.steps[window.steps.len() - 1];
+        let targets = views_of(newest, &window.map_from_anchor, &self.cameras);
+        let (time_sec, want) = (newest_time_sec(window), Want { flow: true, motion: false });
+        let mut draw = |scene: &Scene| self.engine.render(scene, &targets, time_sec, want);
+        let found = difference(newest, &draw(exact)?, &draw(&rough)?, Quat::IDENTITY);
+        self.timings.add("shadow", start.elapsed().as_secs_f64() * 1e3);
+        Ok(found)
+    }
+
+    /// The last computed step drawn at the window's newest time and poses, where that explains its pictures everywhere.
+    fn predict(&mut self, window: &Window<Frame>, last: &Computed, demand: Demand) -> Option<Predicted> {
+        let start = Instant::now();
+        let then = &last.window;
+        let first_ns = then.steps.first().map_or(then.stamp_ns, |s| s.stamp_ns);
+        let targets = views_of(&window.steps[window.steps.len() - 1], &then.map_from_anchor, &self.cameras);
+        let want = Want { flow: true, motion: demand.motion };
+        let time_sec = seconds_between(first_ns, window.stamp_ns) as f32;
+        let views = self.engine.render(&last.scene, &targets, time_sec, want);
+        let found = views.ok().filter(|views| {
+            let explained = explains(&self.config.skip, last, window, views, &self.cameras);
+            if let Err(why) = explained {
+                debug!("window at {} ns is not what was predicted: {why:?}", window.stamp_ns);
+            }
+            explained.is_ok()
+        });
+        self.timings.add("predict", start.elapsed().as_secs_f64() * 1e3);
+        found.map(|views| Predicted {
+            window: Window { map_from_anchor: then.map_from_anchor, ..window.clone() },
+            views,
+        })
+    }
+
+    /// A window that the last computed one explains: its Gaussians at the new time. The map is told nothing: there is nothing new.
+    fn extrapolated(&mut self, predicted: Predicted, last: &Computed, demand: Demand) -> Step {
+        let start = Instant::now();
+        let Predicted { window, views } = predicted;
+        let scene = Arc::new(moved_on(&last.scene, &last.window, &window));
+        self.follow(&scene, &window, demand);
+        let pixels = pixel_flow(&last.window, &window, &views, &self.cameras);
+        let total_ms = start.elapsed().as_secs_f64() * 1e3 + self.timings.newest("predict");
+        let now =
+            Computed { window, scene, views: views.into(), agreement: Arc::clone(&last.agreement), ..last.clone() };
+        let step = self.step(now, demand, Some(Notch::Predicted), total_ms);
+        Step { pixels: Some(pixels), ..step }
     }
 
     /// Runs windows that follow each other, the network on all of them in one forward pass, the rest one by one. In
-    /// order, one result each. Several windows at once are all computed.
+    /// order, one result each. Several windows at once are all computed, exactly.
     pub fn run_all(&mut self, mut windows: Vec<Window<Frame>>) -> Result<Vec<StepResult>> {
         if windows.len() <= 1 {
             let Some(window) = windows.pop() else { return Ok(Vec::new()) };
@@ -181,11 +287,16 @@ impl StepMaker {
             return Ok(vec![self.result(step)]);
         }
         let start = Instant::now();
-        let scenes = self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras)?;
+        let shortcuts = self.engine.shortcuts().clone();
+        self.engine.set_shortcuts(Shortcuts::default());
+        let scenes = self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras);
+        self.engine.set_shortcuts(shortcuts);
+        let scenes = scenes?;
         let network_ms = start.elapsed().as_secs_f64() * 1e3 / windows.len() as f64;
         let all = windows.into_iter().zip(scenes);
         all.map(|(window, scene)| {
-            let step = self.take_in(window, scene, network_ms, Demand::ALL, false)?;
+            let ran = Ran { scene, ms: network_ms, approximate: false };
+            let step = self.take_in(window, ran, Demand::ALL, None)?;
             Ok(self.result(step))
         })
         .collect()
@@ -195,16 +306,16 @@ impl StepMaker {
         StepResult { step, tracks: self.ended_tracks(), objects: self.ended_objects() }
     }
 
-    /// What follows the network. `network_ms` is this window's share of its time; `check` belongs to the gate.
+    /// What follows the network; `shadow` belongs to the gate.
     fn take_in(
         &mut self,
         window: Window<Frame>,
-        scene: Result<Scene>,
-        network_ms: f64,
+        ran: Ran,
         demand: Demand,
-        check: bool,
+        shadow: Option<&Shadow>,
     ) -> Result<Option<Step>> {
         let start = Instant::now();
+        let Ran { scene, ms: network_ms, approximate } = ran;
         self.timings.add("network", network_ms);
         let mut scene = match scene {
             Ok(scene) => scene,
@@ -217,8 +328,10 @@ impl StepMaker {
                 _ => return Err(e),
             },
         };
-        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
-        let stamps_ns: Vec<i64> = window.steps.iter().map(|s| s.stamp_ns).collect();
+        // A network told to may give the newest timestep alone.
+        let given = &window.steps[window.steps.len() - scene.shape.timesteps.min(window.steps.len())..];
+        let poses: Vec<Rigid> = given.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
+        let stamps_ns: Vec<i64> = given.iter().map(|s| s.stamp_ns).collect();
         let look = OverlapLook {
             stamps_ns: &stamps_ns,
             epoch: window.epoch,
@@ -228,7 +341,7 @@ impl StepMaker {
         };
         let agreement = self.timings.time("overlap", || self.overlap.step(&mut scene, &look));
         let newest = window.steps.len() - 1;
-        let views = if demand.pictures || demand.map {
+        let views = if demand.drawn() || self.skipper.wants_views() {
             let targets = views_of(&window.steps[newest], &window.map_from_anchor, &self.cameras);
             let time_sec = newest_time_sec(&window);
             let want = Want { flow: true, motion: demand.motion };
@@ -237,6 +350,7 @@ impl StepMaker {
             Vec::new()
         };
         if demand.map {
+            let first_new = self.first_new(&stamps_ns);
             let look = SceneLook {
                 stamp_ns: window.stamp_ns,
                 map_from_anchor: &window.map_from_anchor,
@@ -245,7 +359,7 @@ impl StepMaker {
                 poses: &poses,
                 rendered: &views,
                 confidence: &agreement.geometry,
-                first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
+                first_new,
             };
             self.timings.time("map", || self.map.fuse_scene(&look));
         } else {
@@ -253,12 +367,23 @@ impl StepMaker {
             self.map.set_origin(window.map_from_anchor.translation);
         }
         let (scene, views, agreement) = (Arc::new(scene), Arc::from(views), Arc::new(agreement));
-        let computed = Computed { window, scene, views, agreement, demand };
-        self.skipper.computed(&computed, check);
+        let computed = Computed { window, scene, views, agreement, demand, approximate };
+        self.skipper.computed(&computed, shadow);
         self.follow(&computed.scene, &computed.window, demand);
-        let Computed { window, scene, views, agreement, .. } = computed;
         let total_ms = network_ms + start.elapsed().as_secs_f64() * 1e3;
-        Ok(Some(self.step(window, scene, views, agreement, total_ms)))
+        let notch = approximate.then_some(Notch::Approximate);
+        Ok(Some(self.step(computed, demand, notch, total_ms)))
+    }
+
+    /// The first of the newest timesteps that the map was not given before, windows that were skipped left out; it is given them
+    /// now.
+    fn first_new(&mut self, stamps_ns: &[i64]) -> usize {
+        let new = stamps_ns.iter().rev().take_while(|s| !self.fused.contains(s)).count();
+        self.fused.extend(&stamps_ns[stamps_ns.len() - new..]);
+        while self.fused.len() > FUSED_KEPT {
+            self.fused.pop_front();
+        }
+        stamps_ns.len() - new
     }
 
     /// A window that shows what `last` showed: its result, with the new stamps. The map is told nothing, having been told.
@@ -268,12 +393,12 @@ impl StepMaker {
         let window = Window { map_from_anchor: last.window.map_from_anchor, ..window };
         self.follow(&last.scene, &window, demand);
         let total_ms = start.elapsed().as_secs_f64() * 1e3;
-        self.step(window, last.scene, last.views, last.agreement, total_ms)
+        self.step(Computed { window, ..last }, demand, Some(Notch::Still), total_ms)
     }
 
     /// What moves, into the trajectories and the objects.
     fn follow(&mut self, scene: &Scene, window: &Window<Frame>, demand: Demand) {
-        let newest = window.steps.len() - 1;
+        let newest = scene.shape.timesteps - 1;
         if demand.tracks {
             let mut points = select::moving_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
             for p in &mut points {
@@ -288,18 +413,14 @@ impl StepMaker {
         }
     }
 
-    fn step(
-        &mut self,
-        window: Window<Frame>,
-        scene: Arc<Scene>,
-        views: Arc<[RenderedView]>,
-        agreement: Arc<Agreement>,
-        total_ms: f64,
-    ) -> Step {
+    fn step(&mut self, of: Computed, demand: Demand, notch: Option<Notch>, total_ms: f64) -> Step {
         self.timings.add("step", total_ms);
         let index = self.steps;
         self.steps += 1;
-        Step { index, window, scene, views, agreement, total_ms }
+        let Computed { window, scene, views, agreement, .. } = of;
+        // The gate's own views are nobody else's.
+        let views = if demand.drawn() { views } else { Arc::from([]) };
+        Step { index, window, scene, views, agreement, notch, pixels: None, total_ms }
     }
 
     /// Moving objects that have ended since the last call.

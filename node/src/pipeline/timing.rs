@@ -46,6 +46,11 @@ impl Timings {
         self.stages.iter().filter_map(|(stage, ms)| Some((*stage, f64::from(*ms.last()?))))
     }
 
+    /// The newest time of one stage, milliseconds; 0 before its first.
+    pub fn newest(&self, stage: &str) -> f64 {
+        self.stages.get(stage).and_then(|ms| ms.last()).map_or(0.0, |ms| f64::from(*ms))
+    }
+
     /// Takes over all of `other`'s entries.
     pub fn merge(&mut self, other: Self) {
         for (stage, mut ms) in other.stages {

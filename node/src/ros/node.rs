@@ -246,7 +246,8 @@ impl Running {
             self.take(&messages, &mut describer);
             if let Some((rig, store)) = describer.build(&self.config, size) {
                 let engine =
-                    Engine::new(model, &self.config.model, rig.cameras.len(), self.config.window.timespan_sec)?;
+                    Engine::new(model, &self.config.model, rig.cameras.len(), self.config.window.timespan_sec)?
+                        .with_skips(&self.config.skip);
                 let weights = engine.weights();
                 if weights == UNTRAINED {
                     warn!("weights: untrained. Seeded random weights stand in; the results show the plumbing alone");

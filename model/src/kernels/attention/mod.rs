@@ -13,6 +13,7 @@
 
 mod backward;
 mod pack;
+mod pairs;
 
 use std::cell::RefCell;
 
@@ -26,7 +27,8 @@ use super::simd::{Kernel, Simd, dispatch};
 use pack::{Layout, Sizes, Source, pack};
 
 pub use backward::{Source as BackwardSource, attention_backward};
-pub use pack::Shape;
+pub use pack::{Inputs, Rows, Shape};
+pub use pairs::attention_in_pairs;
 
 /// Queries of a task: a multiple of both tile heights.
 const BLOCK_QUERIES: usize = 96;
@@ -84,6 +86,8 @@ struct Task<'a> {
     blocks: &'a [f32],
     /// The largest of them.
     sizes: Sizes,
+    /// Added to the logits, for whole blocks of keys; and its largest size.
+    bias: Option<(&'a [f32], f32)>,
     scratch: &'a mut Scratch,
     out: Output,
     /// Log-sum-exp of each query's logits in units of log 2, `(batch, heads, tokens)`, where it is kept.
@@ -109,7 +113,9 @@ impl Kernel for Task<'_> {
         let mut largest = [0f32; BLOCK_QUERIES];
         let mut total = [0f32; BLOCK_QUERIES];
         let mut shrink = [0f32; BLOCK_QUERIES];
-        let flat = query * self.sizes.key <= FLAT_LOGITS * FLAT_LOGITS && self.sizes.value <= FLAT_VALUES * FLAT_VALUES;
+        let room = FLAT_LOGITS - self.bias.map_or(0.0, |(_, largest)| largest);
+        let flat =
+            room >= 0.0 && query * self.sizes.key <= room * room && self.sizes.value <= FLAT_VALUES * FLAT_VALUES;
         let totals = totals.at_least(BLOCK_QUERIES * S::W);
         match flat {
             true => totals.fill(0.0),
@@ -117,14 +123,15 @@ impl Kernel for Task<'_> {
         }
 
         for (index, block) in self.blocks.chunks_exact(layout.block_floats).enumerate() {
-            let count = BLOCK_KEYS.min(shape.tokens - index * BLOCK_KEYS);
+            let count = BLOCK_KEYS.min(self.source.inputs.count - index * BLOCK_KEYS);
             let (keys, values) = block.split_at(layout.key_floats);
+            let bias = self.bias.map(|(bias, _)| &bias[index * BLOCK_KEYS..][..BLOCK_KEYS]);
             if flat {
-                flat_weights::<S, MR>(&q[..panels * MR * d], d, keys, count, weights, totals);
+                flat_weights::<S, MR>(&q[..panels * MR * d], d, keys, bias, count, weights, totals);
                 add_values::<S, MR>(weights, values, layout, count, panels, None, sums);
                 continue;
             }
-            logits::<S, MR>(&q[..panels * MR * d], d, keys, count, weights);
+            logits::<S, MR>(&q[..panels * MR * d], d, keys, bias, count, weights);
             let width = count.next_multiple_of(nr);
             for r in 0..panels * MR {
                 let row = &mut weights[r * BLOCK_KEYS..][..width];
@@ -163,16 +170,36 @@ impl Kernel for Task<'_> {
     }
 }
 
+/// What the sums of a panel of keys start from.
+#[inline(always)]
+fn start_at<S: Simd>(bias: Option<&[f32]>, first: usize) -> [S::V; 2] {
+    match bias {
+        // SAFETY: two vectors, as just cut.
+        Some(bias) => unsafe {
+            let two = &bias[first..first + 2 * S::W];
+            [S::load(two.as_ptr()), S::load(two.as_ptr().add(S::W))]
+        },
+        None => [S::zero(); 2],
+    }
+}
+
 /// Logits of whole row panels of queries against `count` keys, rows of [`BLOCK_KEYS`].
 #[inline(always)]
-fn logits<S: Simd, const MR: usize>(q: &[f32], d: usize, keys: &[f32], count: usize, weights: &mut [f32]) {
+fn logits<S: Simd, const MR: usize>(
+    q: &[f32],
+    d: usize,
+    keys: &[f32],
+    bias: Option<&[f32]>,
+    count: usize,
+    weights: &mut [f32],
+) {
     let nr = 2 * S::W;
     for (j, b) in keys.chunks_exact(d * nr).take(count.div_ceil(nr)).enumerate() {
         for (a, to) in q.chunks_exact(d * MR).zip(weights.chunks_exact_mut(MR * BLOCK_KEYS)) {
             // SAFETY: `a` has `d` columns of MR, `b` `d` rows of two vectors; `to` MR rows of BLOCK_KEYS, of which panel `j`
             // is inside.
             unsafe {
-                let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [[S::zero(); 2]; MR]);
+                let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [start_at::<S>(bias, j * nr); MR]);
                 for r in 0..MR {
                     let row = to.as_mut_ptr().add(r * BLOCK_KEYS + j * nr);
                     S::store(row, acc[r][0]);
@@ -189,6 +216,7 @@ fn flat_weights<S: Simd, const MR: usize>(
     q: &[f32],
     d: usize,
     keys: &[f32],
+    bias: Option<&[f32]>,
     count: usize,
     weights: &mut [f32],
     totals: &mut [f32],
@@ -201,7 +229,7 @@ fn flat_weights<S: Simd, const MR: usize>(
             // SAFETY: `a` has `d` columns of MR, `b` `d` rows of two vectors; `to` MR rows of BLOCK_KEYS, of which panel `j`
             // is inside; `totals` MR vectors.
             unsafe {
-                let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [[S::zero(); 2]; MR]);
+                let acc = tile::<S, MR>(d, a.as_ptr(), MR, 1, b.as_ptr(), [start_at::<S>(bias, j * nr); MR]);
                 for r in 0..MR {
                     let row = to.as_mut_ptr().add(r * BLOCK_KEYS + j * nr);
                     let (mut low, mut high) = (exp2_short::<S>(acc[r][0]), exp2_short::<S>(acc[r][1]));
@@ -310,7 +338,15 @@ fn row_weights<S: Simd>(row: &mut [f32], top: f32) -> f32 {
 ///
 /// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
 pub fn attention(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) {
-    run(isa, qkv, shape, out, None);
+    run(isa, &Inputs::joined(qkv, &shape), shape, out, None);
+}
+
+/// As [`attention`], of queries, keys and values that may be rows of different matrices; `shape.tokens` is the number of
+/// queries of each sequence.
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
+pub fn attention_of(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32]) {
+    run(isa, inputs, shape, out, None);
 }
 
 /// As [`attention`]; also returns what [`attention_backward`] needs of each row: the log-sum-exp of its logits in units
@@ -320,24 +356,35 @@ pub fn attention(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) {
 pub fn attention_keeping(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) -> Vec<f32> {
     let mut log_sums = vec![0f32; shape.batch * shape.tokens * shape.heads];
     let to = Output { start: log_sums.as_mut_ptr(), len: log_sums.len() };
-    run(isa, qkv, shape, out, Some(to));
+    run(isa, &Inputs::joined(qkv, &shape), shape, out, Some(to));
     log_sums
 }
 
-fn run(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32], log_sums: Option<Output>) {
-    let rows = shape.batch * shape.tokens;
-    assert_eq!(qkv.len(), rows * 3 * shape.width(), "qkv of {shape:?}");
-    assert_eq!(out.len(), rows * shape.width(), "output of {shape:?}");
+/// The bias in whole blocks, and its largest size (NaN where it holds one).
+fn whole_blocks(inputs: &Inputs<'_>) -> Option<(Vec<f32>, f32)> {
+    let bias = inputs.bias?;
+    let mut padded = vec![0f32; inputs.count.next_multiple_of(BLOCK_KEYS)];
+    padded[..bias.len()].copy_from_slice(bias);
+    let largest = bias.iter().fold(0f32, |a, x| if x.abs() <= a { a } else { x.abs() });
+    Some((padded, largest))
+}
+
+fn run(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32], log_sums: Option<Output>) {
+    inputs.check(&shape);
+    assert_eq!(out.len(), shape.batch * shape.tokens * shape.width(), "output of {shape:?}");
     if out.is_empty() {
         return;
     }
-    let layout = Layout::new(isa, &shape);
+    assert!(inputs.count > 0, "no keys");
+    let bias = whole_blocks(inputs);
+    let bias = bias.as_ref().map(|(bias, largest)| (&bias[..], *largest));
+    let layout = Layout::new(isa, shape.head_dim, inputs.count);
     let head_floats = layout.blocks * layout.block_floats;
     let mut memory = PACKED.take();
     let packed = memory.at_least(shape.batch * shape.heads * head_floats);
     let mut sizes = vec![Sizes::default(); shape.batch * shape.heads * layout.blocks];
     packed.par_chunks_exact_mut(layout.block_floats).zip(&mut sizes).enumerate().for_each(|(index, (block, sizes))| {
-        *sizes = pack(qkv, &shape, &layout, index, block);
+        *sizes = pack(inputs, &shape, &layout, index, block);
     });
     let packed = &*packed;
     let sizes: Vec<Sizes> = sizes
@@ -349,12 +396,12 @@ fn run(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32], log_sums: Option<Ou
     (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {
         let (head_index, query_block) = (index / query_blocks, index % query_blocks);
         let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
-        let source = Source { qkv, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
+        let source = Source { inputs, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
         let blocks = &packed[head_index * head_floats..][..head_floats];
         // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
         SCRATCH.with_borrow_mut(|scratch| {
             let sizes = sizes[head_index];
-            dispatch(isa, Task { source, layout: &layout, blocks, sizes, scratch, out: output, log_sums });
+            dispatch(isa, Task { source, layout: &layout, blocks, sizes, bias, scratch, out: output, log_sums });
         });
     });
     PACKED.set(memory);

@@ -8,23 +8,27 @@ const TOLERANCE: f64 = 2e-6;
 /// Logits of 1e4 carry a rounding of up to 1e-3 each, and weights follow it.
 const BIG_LOGITS_TOLERANCE: f64 = 2e-2;
 
-fn reference(qkv: &[f32], s: Shape) -> Vec<f64> {
+/// For logits of tens: a rounding of 2e-6 each, and weights follow it.
+pub(super) const NEARLY: f64 = 3e-5;
+
+pub(super) fn reference(inputs: &Inputs<'_>, s: Shape) -> Vec<f64> {
     let (d, width) = (s.head_dim, s.width());
-    let at = |b: usize, t: usize, part: usize, h: usize, c: usize| -> f64 {
-        qkv[(b * s.tokens + t) * 3 * width + part * width + h * d + c].into()
-    };
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(&x, &y)| f64::from(x) * f64::from(y)).sum::<f64>();
+    let bias = |u: usize| inputs.bias.map_or(0.0, |bias| f64::from(bias[u]) * std::f64::consts::LN_2);
     let mut out = vec![0f64; s.batch * s.tokens * width];
     for b in 0..s.batch {
         for h in 0..s.heads {
             for t in 0..s.tokens {
-                let logits: Vec<f64> = (0..s.tokens)
-                    .map(|u| (0..d).map(|c| at(b, t, 0, h, c) * at(b, u, 1, h, c)).sum::<f64>() / (d as f64).sqrt())
-                    .collect();
+                let query = inputs.queries.head(b * s.tokens + t, h, d);
+                let key = |u: usize| inputs.keys.head(b * inputs.count + u, h, d);
+                let logits: Vec<f64> =
+                    (0..inputs.count).map(|u| dot(query, key(u)) / (d as f64).sqrt() + bias(u)).collect();
                 let top = logits.iter().fold(f64::NEG_INFINITY, |a, &l| a.max(l));
                 let weights: Vec<f64> = logits.iter().map(|l| (l - top).exp()).collect();
                 let total: f64 = weights.iter().sum();
                 for c in 0..d {
-                    let sum: f64 = weights.iter().enumerate().map(|(u, w)| w * at(b, u, 2, h, c)).sum();
+                    let value = |u: usize| f64::from(inputs.values.head(b * inputs.count + u, h, d)[c]);
+                    let sum: f64 = weights.iter().enumerate().map(|(u, w)| w * value(u)).sum();
                     out[(b * s.tokens + t) * width + h * d + c] = sum / total;
                 }
             }
@@ -56,7 +60,7 @@ fn every_shape() {
             qkv.iter_mut().step_by(7).for_each(|x| *x *= 3.0);
             let mut out = vec![f32::NAN; s.batch * s.tokens * s.width()];
             attention(isa, &qkv, s, &mut out);
-            let worst = worst_difference(&out, &reference(&qkv, s));
+            let worst = worst_difference(&out, &reference(&Inputs::joined(&qkv, &s), s));
             assert!(worst < TOLERANCE, "{isa:?} {s:?}: {worst:e}");
         }
     }
@@ -84,7 +88,7 @@ fn either_way_to_the_weights_in_used_memory() {
                 });
                 attention(isa, &qkv, s, &mut out);
             });
-            let worst = worst_difference(&out, &reference(&qkv, s));
+            let worst = worst_difference(&out, &reference(&Inputs::joined(&qkv, &s), s));
             assert!(worst < 10.0 * TOLERANCE, "{isa:?} {scales:?}: {worst:e}");
         }
     }
@@ -101,7 +105,7 @@ fn logits_of_ten_thousand_stay_finite() {
         let mut out = vec![f32::NAN; s.tokens * s.width()];
         attention(isa, &qkv, s, &mut out);
         assert!(out.iter().all(|x| x.is_finite() && x.abs() <= 1.0001));
-        let worst = worst_difference(&out, &reference(&qkv, s));
+        let worst = worst_difference(&out, &reference(&Inputs::joined(&qkv, &s), s));
         assert!(worst < BIG_LOGITS_TOLERANCE, "{isa:?}: {worst:e}");
     }
 }

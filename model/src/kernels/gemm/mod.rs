@@ -10,6 +10,7 @@
 //! row's place in `x` changes its bits.
 
 mod backward;
+pub(crate) mod integer;
 mod pack;
 mod tile;
 
@@ -19,14 +20,16 @@ use rayon::prelude::*;
 
 use super::Isa;
 use super::aligned::Aligned;
+use super::math::bf16;
 use super::simd::{Kernel, Simd, dispatch, prefetch};
 use crate::ops::Activation;
-use pack::{Depths, pack_columns, pack_rows};
-use tile::{finish, finish_tile};
+use integer::IntegerScales;
+use pack::{Depths, Numbers, pack_columns, pack_rows};
+use tile::{Product, finish, finish_tile};
 
 pub use backward::{Mlp, MlpGradients, column_sums, mlp_backward, mlp_keeping, weight_gradient};
 pub use pack::PackedWeight;
-pub(crate) use tile::tile;
+pub(crate) use tile::{Floats, Pairs, tile, tile_of};
 
 /// Rows of `x` a task works on at most: a multiple of both tile heights.
 const BLOCK_ROWS: usize = 96;
@@ -62,6 +65,8 @@ struct Scratch {
 #[derive(Default)]
 pub(super) struct BlockScratch {
     packed: Aligned,
+    /// Of rows in whole numbers.
+    scales: Aligned,
     partial: Aligned,
 }
 
@@ -92,28 +97,53 @@ impl Kernel for Block<'_> {
 
     #[inline(always)]
     fn run<S: Simd, const MR: usize>(self) {
-        let (n, k) = (self.w.n, self.w.k);
+        match &self.w.numbers {
+            Numbers::Pairs(scales) => {
+                let scales = Some(scales);
+                self.run_in::<S, MR, Pairs>(scales)
+            }
+            Numbers::Floats | Numbers::Rounded => self.run_in::<S, MR, Floats>(None),
+        }
+    }
+}
+
+impl<'a> Block<'a> {
+    #[inline(always)]
+    fn run_in<S: Simd, const MR: usize, P: Product>(self, scales: Option<&'a IntegerScales>) {
+        // Depths are counted in packed rows: inputs, or pairs of them.
+        let (n, k) = (self.w.n, self.w.depth());
         let Epilogue { bias, act, residual } = self.epilogue;
         let nr = 2 * S::W;
         let m = self.out.len() / n;
         let row_panels = m.div_ceil(MR);
         let packed = self.scratch.packed.at_least(row_panels * MR * k);
         // Row panels that are not packed.
-        let direct = match self.x {
-            Rows::Lying(x) if k <= DIRECT_DEPTH => {
+        let rounded = matches!(self.w.numbers, Numbers::Rounded);
+        let row_scales = self.scratch.scales.at_least(row_panels * MR);
+        let direct = match (self.x, scales) {
+            // Rows in whole numbers lie one after the other, and are read so.
+            (Rows::Lying(x), Some(scales)) => {
+                integer::quantise_rows(x, self.w.k, scales.largest_input(), packed, row_scales);
+                &[]
+            }
+            (Rows::Standing { .. }, Some(_)) => unreachable!("only weights as floats meet standing rows"),
+            (Rows::Lying(x), None) if k <= DIRECT_DEPTH && !rounded => {
                 let whole = m / MR;
                 pack_rows::<MR>(&x[whole * MR * k..], k, &mut packed[whole * MR * k..]);
                 &x[..whole * MR * k]
             }
-            Rows::Lying(x) => {
+            (Rows::Lying(x), None) => {
                 pack_rows::<MR>(x, k, packed);
                 &[]
             }
-            Rows::Standing { values, stride, first } => {
+            (Rows::Standing { values, stride, first }, None) => {
                 pack_columns::<MR>(values, stride, first, m, packed);
                 &[]
             }
         };
+        if rounded {
+            packed.iter_mut().for_each(|x| *x = bf16(*x));
+        }
         let weights = self.w.data.as_slice();
         let block_panels = BLOCK_COLS / nr;
         let depths = Depths::new(self.w.isa, k);
@@ -149,12 +179,19 @@ impl Kernel for Block<'_> {
                                 }
                             }
                             acc = match direct.get(i * MR * k..(i + 1) * MR * k) {
+                                _ if P::PAIRS => {
+                                    let rows = &packed[i * MR * k..(i + 1) * MR * k];
+                                    tile_of::<S, MR, P>(depth, rows.as_ptr().add(at), 1, k, b.as_ptr(), acc)
+                                }
                                 // Only for depths that are taken at once.
                                 Some(rows) => tile::<S, MR>(depth, rows.as_ptr(), 1, k, b.as_ptr(), acc),
                                 None => tile::<S, MR>(depth, a.as_ptr(), MR, 1, b.as_ptr(), acc),
                             };
                         }
                         let rows = MR.min(m - i * MR);
+                        if let Some(scales) = scales.filter(|_| last) {
+                            scales.to_floats::<S, MR>(&mut acc, &row_scales[i * MR..(i + 1) * MR], col);
+                        }
                         if last && width == nr {
                             let bias = bias.map(|b| &b[col..col + nr]);
                             let residual = residual.map(|x| &x[i * MR * n..]);

@@ -2,8 +2,11 @@
 
 use rayon::prelude::*;
 
+use super::integer::{self, IntegerScales};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
+use crate::kernels::math::bf16;
+use crate::ops::Precision;
 
 /// Equal-sized slices of the summed dimension, none deeper than the panel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,14 +30,26 @@ impl Depths {
     }
 }
 
-/// A weight `(n, k)` laid out as the kernel reads it: per panel of `tile_cols` outputs, `k` rows of that many floats,
-/// zeros past `n`.
+/// What the numbers of a packed weight are.
+#[derive(Debug)]
+pub(super) enum Numbers {
+    /// As they were.
+    Floats,
+    /// Floats rounded to bf16, which the rows that meet them are too.
+    Rounded,
+    /// Pairs of 16-bit whole numbers, see [`super::integer`].
+    Pairs(IntegerScales),
+}
+
+/// A weight `(n, k)` laid out as the kernel reads it: per panel of `tile_cols` outputs, `k` rows of that many floats (or
+/// half as many rows of pairs of whole numbers), zeros past `n`.
 #[derive(Debug)]
 pub struct PackedWeight {
     pub(super) isa: Isa,
     pub(super) n: usize,
     pub(super) k: usize,
     pub(super) data: Aligned,
+    pub(super) numbers: Numbers,
 }
 
 impl PackedWeight {
@@ -50,13 +65,49 @@ impl PackedWeight {
                 }
             }
         });
-        Self { isa, n, k, data }
+        Self { isa, n, k, data, numbers: Numbers::Floats }
+    }
+
+    /// Packs a row-major `(n, k)` weight, `k > 0`, for products in this precision.
+    pub fn in_precision(isa: Isa, precision: Precision, weight: &[f32], n: usize, k: usize) -> Self {
+        match precision {
+            Precision::F32 => Self::new(isa, weight, n, k),
+            Precision::Bf16 => {
+                let mut packed = Self::new(isa, weight, n, k);
+                packed.data.as_mut_slice().iter_mut().for_each(|x| *x = bf16(*x));
+                Self { numbers: Numbers::Rounded, ..packed }
+            }
+            Precision::Int16 => Self::whole(isa, weight, n, k, integer::balanced(weight, k)),
+            Precision::Int8 => Self::whole(isa, weight, n, k, integer::EIGHT_BITS),
+        }
+    }
+
+    /// With weights in whole numbers up to `largest`. AVX-512 machines run the AVX2 kernel: wider products of pairs would
+    /// be code that nobody has run.
+    fn whole(isa: Isa, weight: &[f32], n: usize, k: usize, largest: f32) -> Self {
+        assert!(k > 0 && weight.len() == n * k, "weight of {n} x {k}");
+        let isa = if isa == Isa::Avx512 { Isa::Avx2 } else { isa };
+        let nr = isa.tile_cols();
+        let pairs = k.div_ceil(2);
+        let mut data = Aligned::zeroed(n.div_ceil(nr) * nr * pairs);
+        let scales = integer::quantise_weight(weight, k, largest, nr, |row, p, pair| {
+            data.as_mut_slice()[row / nr * nr * pairs + p * nr + row % nr] = f32::from_bits(pair);
+        });
+        Self { isa, n, k, data, numbers: Numbers::Pairs(scales) }
+    }
+
+    /// Rows of a packed panel: inputs, or pairs of them.
+    pub(super) fn depth(&self) -> usize {
+        match self.numbers {
+            Numbers::Pairs(_) => self.k.div_ceil(2),
+            _ => self.k,
+        }
     }
 
     /// Packs the transpose of row-major `values` `(k, n)`: the layer that goes back through a weight `(k, n)`, or a sum
     /// over rows. `k > 0`.
     pub fn transposed(isa: Isa, values: &[f32], n: usize, k: usize) -> Self {
-        let mut packed = Self { isa, n, k, data: Aligned::default() };
+        let mut packed = Self { isa, n, k, data: Aligned::default(), numbers: Numbers::Floats };
         packed.pack_transposed(values, n, k);
         packed
     }

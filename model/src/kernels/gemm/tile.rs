@@ -4,12 +4,57 @@ use crate::kernels::math::activate;
 use crate::kernels::simd::Simd;
 use crate::ops::Activation;
 
+/// What the lanes of a tile are, and how they are multiplied and summed.
+pub(crate) trait Product {
+    /// Whether lanes are pairs of 16-bit whole numbers with 32-bit sums, seen as bits.
+    const PAIRS: bool;
+    fn add<S: Simd>(a: S::V, b: S::V, sum: S::V) -> S::V;
+}
+
+/// Floats.
+pub(crate) struct Floats;
+/// Pairs of 16-bit whole numbers, sums in 32 bits.
+pub(crate) struct Pairs;
+
+impl Product for Floats {
+    const PAIRS: bool = false;
+    #[inline(always)]
+    fn add<S: Simd>(a: S::V, b: S::V, sum: S::V) -> S::V {
+        S::mul_add(a, b, sum)
+    }
+}
+
+impl Product for Pairs {
+    const PAIRS: bool = true;
+    #[inline(always)]
+    fn add<S: Simd>(a: S::V, b: S::V, sum: S::V) -> S::V {
+        S::mul_add_pairs(a, b, sum)
+    }
+}
+
+/// [`tile_of`] floats.
+///
+/// # Safety
+/// As there.
+#[inline(always)]
+pub(crate) unsafe fn tile<S: Simd, const MR: usize>(
+    depth: usize,
+    a: *const f32,
+    a_step: usize,
+    a_row: usize,
+    b: *const f32,
+    acc: [[S::V; 2]; MR],
+) -> [[S::V; 2]; MR] {
+    // SAFETY: the caller's contract.
+    unsafe { tile_of::<S, MR, Floats>(depth, a, a_step, a_row, b, acc) }
+}
+
 /// `acc + a b` over `depth` products: `a[p * a_step + r * a_row]` for row `r`, `b` a packed panel of two vectors a row.
 ///
 /// # Safety
 /// `a` must be readable at those indices for `p < depth`, `r < MR`; `b` for `depth * 2 * W` floats.
 #[inline(always)]
-pub(crate) unsafe fn tile<S: Simd, const MR: usize>(
+pub(crate) unsafe fn tile_of<S: Simd, const MR: usize, P: Product>(
     depth: usize,
     a: *const f32,
     a_step: usize,
@@ -24,8 +69,8 @@ pub(crate) unsafe fn tile<S: Simd, const MR: usize>(
             let (b0, b1) = (S::load(b), S::load(b.add(S::W)));
             for r in 0..MR {
                 let x = S::splat(*a.add(r * a_row));
-                acc[r][0] = S::mul_add(x, b0, acc[r][0]);
-                acc[r][1] = S::mul_add(x, b1, acc[r][1]);
+                acc[r][0] = P::add::<S>(x, b0, acc[r][0]);
+                acc[r][1] = P::add::<S>(x, b1, acc[r][1]);
             }
             a = a.add(a_step);
             b = b.add(2 * S::W);

@@ -9,6 +9,7 @@ use anyhow::{Context, Result};
 use storm_model::train::{StepReport, Validation};
 
 use crate::output::atomic::write_bytes;
+use crate::output::plot::{self, Axis, Drawn, Panel, Series};
 
 /// Every loss term there is; those a run does not have stay empty.
 const TERMS: [&str; 18] = [
@@ -166,94 +167,30 @@ impl Curves {
             .collect();
         let figure = |k: usize| (FIGURES[k], self.figures.series(k));
         let panels = [
-            panel(0, "Loss terms (weighted, logarithmic)", &losses, true),
-            panel(1, "Held-out depth error over depth", &[figure(0)], false),
+            panel("Loss terms (weighted, logarithmic)", &losses, true),
+            panel("Held-out depth error over depth", &[figure(0)], false),
             panel(
-                2,
                 "Held-out velocity error of moving pixels, m/s (dashes: taken as still)",
                 &[figure(3), figure(4)],
                 false,
             ),
-            panel(3, "Held-out PSNR of rendered pictures, dB", &[figure(5)], false),
+            panel("Held-out PSNR of rendered pictures, dB", &[figure(5)], false),
         ];
-        let height = PANEL_HEIGHT * panels.len() as f64;
-        let svg = format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {height}\" font-family=\"sans-serif\" font-size=\"12\">\n\
-             <rect width=\"{WIDTH}\" height=\"{height}\" fill=\"white\"/>\n{}</svg>\n",
-            panels.concat()
-        );
-        Ok(write_bytes(&self.picture, svg.as_bytes())?)
+        Ok(write_bytes(&self.picture, plot::svg(&panels).as_bytes())?)
     }
 }
 
-/// Sizes in SVG units (pixels at full width).
-const WIDTH: f64 = 900.0;
-const PANEL_HEIGHT: f64 = 240.0;
-const LEFT: f64 = 70.0;
-const RIGHT: f64 = 130.0;
-const TOP: f64 = 30.0;
-const BOTTOM: f64 = 30.0;
+/// Smaller loss terms are drawn as this.
+const LOSS_FLOOR: f64 = 1e-5;
 
-/// Smaller values are drawn as this where the axis is logarithmic.
-const LOG_FLOOR: f64 = 1e-5;
-
-/// Ten colours that stay apart for colour-blind readers too; further lines repeat them dashed.
-const COLORS: [&str; 10] =
-    ["#1f77b4", "#d95f02", "#1b9e77", "#7570b3", "#e7298a", "#66a61e", "#a6761d", "#444444", "#17becf", "#b22222"];
-
-fn panel(index: usize, title: &str, lines: &[(&str, Vec<(f64, f64)>)], log: bool) -> String {
-    let scaled = |y: f64| if log { y.max(LOG_FLOOR).log10() } else { y };
-    let all = || lines.iter().flat_map(|(_, points)| points.iter());
-    let range = |values: &mut dyn Iterator<Item = f64>| {
-        let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(x), h.max(x)));
-        match (low.is_finite() && high.is_finite(), high > low) {
-            (false, _) => (0.0, 1.0),
-            (true, false) => (low - 0.5, high + 0.5),
-            (true, true) => (low, high),
-        }
+fn panel(title: &str, lines: &[(&str, Vec<(f64, f64)>)], log: bool) -> Panel {
+    let series = |(name, points): &(&str, Vec<(f64, f64)>)| Series {
+        name: (*name).into(),
+        points: points.iter().map(|&(x, y)| (x, if log { y.max(LOSS_FLOOR) } else { y })).collect(),
+        drawn: if name.ends_with("still") { Drawn::Dashed } else { Drawn::Line },
     };
-    let (x0, x1) = range(&mut all().map(|p| p.0));
-    let (y0, y1) = range(&mut all().map(|p| scaled(p.1)));
-    let top = PANEL_HEIGHT * index as f64;
-    let (w, h) = (WIDTH - LEFT - RIGHT, PANEL_HEIGHT - TOP - BOTTOM);
-    let px = |x: f64| LEFT + (x - x0) / (x1 - x0) * w;
-    let py = |y: f64| top + TOP + (1.0 - (y - y0) / (y1 - y0)) * h;
-    let mut svg = format!(
-        "<text x=\"{LEFT}\" y=\"{}\" font-weight=\"bold\">{title}</text>\n<rect x=\"{LEFT}\" y=\"{}\" width=\"{w}\" height=\"{h}\" fill=\"none\" stroke=\"#999\"/>\n",
-        top + 20.0,
-        top + TOP
-    );
-    for k in 0..5 {
-        let y = y0 + (y1 - y0) * f64::from(k) / 4.0;
-        let label = if log { format!("{:.1e}", 10f64.powf(y)) } else { format!("{y:.3}") };
-        let at = py(y);
-        svg += &format!(
-            "<line x1=\"{LEFT}\" x2=\"{}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"#ddd\"/><text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{label}</text>\n",
-            LEFT + w,
-            LEFT - 6.0,
-            at + 4.0
-        );
-    }
-    for (x, anchor) in [(x0, "start"), (x1, "end")] {
-        svg += &format!(
-            "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\">step {x:.0}</text>\n",
-            px(x),
-            top + PANEL_HEIGHT - 12.0
-        );
-    }
-    for (k, (name, points)) in lines.iter().enumerate() {
-        let color = COLORS[k % COLORS.len()];
-        let dash = if k >= COLORS.len() || name.ends_with("still") { " stroke-dasharray=\"5 4\"" } else { "" };
-        let path: Vec<String> = points.iter().map(|p| format!("{:.1},{:.1}", px(p.0), py(scaled(p.1)))).collect();
-        svg += &format!(
-            "<polyline points=\"{}\" fill=\"none\" stroke=\"{color}\" stroke-width=\"1.5\"{dash}/>\n\
-             <text x=\"{}\" y=\"{:.1}\" fill=\"{color}\">{name}</text>\n",
-            path.join(" "),
-            LEFT + w + 8.0,
-            top + TOP + 12.0 + 14.0 * k as f64
-        );
-    }
-    svg
+    let y = Axis { label: String::new(), log };
+    Panel { title: title.into(), x: Axis::linear("step"), y, series: lines.iter().map(series).collect() }
 }
 
 /// Error figures in one line.

@@ -34,10 +34,8 @@ pub struct Status {
     pub windows: WindowCounts,
     /// Windows whose result was not finite.
     pub non_finite_windows: u64,
-    /// Steps that were not computed because nothing had changed, and how checks of them went.
+    /// Steps that were not computed, or approximated, and how checks of them went.
     pub skips: SkipCounts,
-    /// Skips allowed between two checks at present; 0: none.
-    pub skip_level: u64,
     /// Steps that failed.
     pub failed_steps: u64,
     /// Outputs that could not be sent.

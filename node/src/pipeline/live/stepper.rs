@@ -241,7 +241,6 @@ impl Stepper {
             windows: self.front.window_counts(),
             non_finite_windows: self.maker.non_finite(),
             skips: self.maker.skips(),
-            skip_level: self.maker.skip_level(),
             failed_steps: own.failed_steps,
             failed_outputs: own.failed_outputs,
             hop_sec: own.hop_sec,

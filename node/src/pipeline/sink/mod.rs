@@ -225,7 +225,7 @@ impl Sink {
             images_in: counts.images_in,
             frames_in: self.sets,
             steps: finished.steps,
-            steps_skipped: finished.skips.still,
+            steps_skipped: finished.skips.skipped(),
             skips: finished.skips,
             dropped: counts.dropped,
             messages_lost: counts.messages_lost,

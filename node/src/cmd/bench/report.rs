@@ -1,0 +1,363 @@
+//! Everything measured as Markdown, as a picture, and as JSON.
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::drives::Drives;
+use super::network::Setting;
+use super::sizes::{Point, rate};
+use crate::engine::figures::Figures;
+use crate::output::plot::{self, Axis, Drawn, Panel, Series};
+
+/// What came out.
+#[derive(Debug, Default, Serialize)]
+pub(super) struct Report {
+    /// The machine.
+    pub machine: Value,
+    /// The command line.
+    pub command: String,
+    /// Load of the machine when it began, where known: other programs make times longer.
+    pub load: Option<f64>,
+    pub settings: Vec<Setting>,
+    /// Per setting of a drive: its name, the keys it changes, and what came out.
+    pub drives: Vec<DriveSetting>,
+    pub baselines: Vec<Baseline>,
+    pub sizes: Vec<Point>,
+    pub world: Value,
+    pub peer_pytorch: Option<Value>,
+}
+
+#[derive(Debug, Serialize)]
+pub(super) struct DriveSetting {
+    pub setting: String,
+    pub skips: Vec<String>,
+    #[serde(flatten)]
+    pub drives: Drives,
+}
+
+#[derive(Debug, Serialize)]
+pub(super) struct Baseline {
+    pub method: &'static str,
+    #[serde(flatten)]
+    pub figures: Figures,
+}
+
+fn cell(x: Option<f64>, digits: usize) -> String {
+    x.map_or("-".into(), |x| format!("{x:.digits$}"))
+}
+
+fn row(cells: &[String]) -> String {
+    format!("| {} |\n", cells.join(" | "))
+}
+
+fn head(names: &[&str]) -> String {
+    format!("| {} |\n|---|{}\n", names.join(" | "), "---:|".repeat(names.len() - 1))
+}
+
+/// The error columns, without unit of PSNR's `against`.
+const ERRORS: [&str; 7] =
+    ["PSNR, dB", "PSNR, moving, dB", "depth RMSE, m", "EPE3D, m/s", "Acc5", "moving IoU", "PSNR on the bag, dB"];
+
+fn errors(f: &Figures, bag_psnr: Option<f64>) -> [String; 7] {
+    [
+        cell(f.psnr, 2),
+        cell(f.psnr_dynamic, 2),
+        cell(f.depth_rmse, 2),
+        cell(f.epe3d, 3),
+        cell(f.acc5, 3),
+        cell(f.moving_iou, 3),
+        cell(bag_psnr, 2),
+    ]
+}
+
+impl Report {
+    /// The document; the picture lies beside it under this name.
+    pub fn markdown(&self, picture: &str) -> String {
+        let mut text = format!(
+            "# Run time against error\n\nMade by `{}` on {} ({} threads{}). Times of one run compare with each other; on another \
+             machine make your own.\n\n![run time against error]({picture})\n\n",
+            self.command,
+            self.machine["cpu"].as_str().unwrap_or("an unknown processor"),
+            self.machine["threads"],
+            self.load.map_or(String::new(), |l| format!(", load {l:.1} when it began")),
+        );
+        text += &self.settings_table();
+        text += &self.baselines_table();
+        text += &self.drives_table();
+        text += &self.sizes_table();
+        text
+    }
+
+    fn settings_table(&self) -> String {
+        let mut text = String::from(
+            "## Settings\n\nFull steps: the network, then the newest pictures drawn with flow and motion groups. Networks with weights are \
+             scored on held-out drives against the truth by `storm eval`'s protocol (more timesteps left out: more pictures held \
+             out); those without against their own exact f32 result. FLOPs are counted, not measured.\n\n",
+        );
+        let mut names = vec![
+            "network, setting",
+            "step p50, ms",
+            "p99",
+            "network p50",
+            "p99",
+            "drawing p50",
+            "p99",
+            "tokens",
+            "GFLOP",
+            "peak, MB",
+            "against",
+        ];
+        names.extend(ERRORS);
+        text += &head(&names);
+        for s in &self.settings {
+            let stage = |name: &str, get: fn(&crate::pipeline::timing::StageStats) -> f64| {
+                cell(s.stages_ms.get(name).map(get), 1)
+            };
+            let mut cells = vec![
+                format!("{}, {}", s.model, s.setting),
+                stage("step", |t| t.p50),
+                stage("step", |t| t.p99),
+                stage("network", |t| t.p50),
+                stage("network", |t| t.p99),
+                stage("render", |t| t.p50),
+                stage("render", |t| t.p99),
+                s.tokens.to_string(),
+                format!("{:.1}", s.gflop),
+                cell(s.peak_rss_mb, 0),
+                if s.against == super::network::TRUTH { "truth".into() } else { "itself, exact".to_string() },
+            ];
+            cells.extend(errors(&s.figures, s.bag_psnr));
+            text += &row(&cells);
+        }
+        if let Some(peer) = &self.peer_pytorch {
+            let ms = peer["median_s"].as_f64().map(|s| 1e3 * s);
+            let mut cells = vec!["PyTorch, B/8's shapes, f32, eager".to_string(), cell(ms, 1), "-".into(), cell(ms, 1)];
+            cells.extend(["-", "-", "-", "7220", "-"].map(String::from));
+            cells.push(cell(peer["peak_rss_mb"].as_f64(), 0));
+            cells.extend(["-"; 8].map(String::from));
+            text += &row(&cells);
+        }
+        text + "\n"
+    }
+
+    fn baselines_table(&self) -> String {
+        if self.baselines.is_empty() {
+            return String::new();
+        }
+        let mut names = vec!["method", "ms per window"];
+        names.extend(&ERRORS[..6]);
+        let mut text =
+            String::from("## Other methods\n\nOn the same clips as `tiny` above (names: README, Held-out error).\n\n")
+                + &head(&names);
+        for b in &self.baselines {
+            let mut cells = vec![format!("`{}`", b.method), cell(b.figures.ms, 0)];
+            cells.extend(errors(&b.figures, None).into_iter().take(6));
+            text += &row(&cells);
+        }
+        text + "\n"
+    }
+
+    fn drives_table(&self) -> String {
+        if self.drives.is_empty() {
+            return String::new();
+        }
+        let mut text = String::from(
+            "## Skipping\n\n`tiny` over drives at 10 Hz, everything asked for (map, trajectories, objects, pictures): mean time per step with \
+             every step computed and with the setting's ladder, on the same windows. Errors are of scenes against the truth, full \
+             and with the ladder. `mixed` is all of them one after the other, four in five steps standing.\n\n",
+        );
+        text += &head(&[
+            "setting",
+            "drive",
+            "steps",
+            "still",
+            "predicted",
+            "approximate",
+            "full, ms",
+            "ladder, ms",
+            "times less",
+            "PSNR, dB",
+            "EPE3D, m/s",
+            "moving IoU",
+            "checks",
+            "broken",
+        ]);
+        for s in &self.drives {
+            for r in &s.drives.rows {
+                let both = |get: fn(&Figures) -> Option<f64>, digits| {
+                    let of = |f: &Option<Figures>| cell(f.as_ref().and_then(get), digits);
+                    format!("{} / {}", of(&r.full), of(&r.skipping))
+                };
+                let mixed = r.drive == "mixed";
+                let count = |n: u64| if mixed { n.to_string() } else { String::new() };
+                text += &row(&[
+                    s.setting.clone(),
+                    r.drive.into(),
+                    r.steps.to_string(),
+                    r.still.to_string(),
+                    r.predicted.to_string(),
+                    r.approximate.to_string(),
+                    format!("{:.1}", r.full_ms),
+                    format!("{:.1}", r.ms),
+                    format!("{:.2}", r.ratio),
+                    both(|f| f.psnr, 2),
+                    both(|f| f.epe3d, 3),
+                    both(|f| f.moving_iou, 3),
+                    count(s.drives.skips.checks),
+                    count(s.drives.skips.broken),
+                ]);
+            }
+        }
+        text + "\n"
+    }
+
+    fn sizes_table(&self) -> String {
+        if self.sizes.is_empty() {
+            return String::new();
+        }
+        let mut text = String::from(
+            "## Cost against size\n\nThe network alone, of `tiny`'s width and without weights, in f32; the last column is the counted work \
+             at the rate of the curve's largest window.\n\n",
+        ) + &head(&[
+            "curve",
+            "timesteps",
+            "cameras",
+            "picture",
+            "tokens",
+            "GFLOP",
+            "measured, ms",
+            "counted, ms",
+        ]);
+        for p in &self.sizes {
+            let curve: Vec<&Point> = self.sizes.iter().filter(|q| q.curve == p.curve).collect();
+            text += &row(&[
+                p.curve.into(),
+                p.timesteps.to_string(),
+                p.cameras.to_string(),
+                format!("{}x{}", p.picture[0], p.picture[1]),
+                p.tokens.to_string(),
+                format!("{:.2}", p.gflop),
+                format!("{:.1}", p.network_ms),
+                format!("{:.1}", p.gflop / rate(&curve)),
+            ]);
+        }
+        text + "\n"
+    }
+
+    /// Milliseconds against error, and against size, where they were measured.
+    pub fn picture(&self) -> String {
+        let against_truth: Vec<&Setting> =
+            self.settings.iter().filter(|s| s.against == super::network::TRUTH).collect();
+        let mut panels = Vec::new();
+        let figures: [(&str, fn(&Figures) -> Option<f64>); 2] =
+            [("PSNR of held-out pictures, dB", |f| f.psnr), ("EPE3D, m/s (lower is better)", |f| f.epe3d)];
+        for (label, get) in figures.into_iter().filter(|_| !against_truth.is_empty()) {
+            let mut series: Vec<Series> = against_truth
+                .iter()
+                .map(|s| Series {
+                    name: format!("{}, {}", s.model, s.setting),
+                    points: get(&s.figures).map(|y| (s.step_ms.p50, y)).into_iter().collect(),
+                    drawn: if s.setting == "default" { Drawn::BoldMark } else { Drawn::Mark },
+                })
+                .collect();
+            series.extend(self.baselines.iter().map(|b| Series {
+                name: format!("{} (method)", b.method),
+                points: b.figures.ms.zip(get(&b.figures)).into_iter().collect(),
+                drawn: Drawn::Mark,
+            }));
+            panels.push(Panel {
+                title: format!("Step time against {label}"),
+                x: Axis::log("milliseconds per step, median"),
+                y: Axis::linear(label),
+                series,
+            });
+        }
+        for curve in ["tokens", "cameras", "timesteps"] {
+            let points: Vec<&Point> = self.sizes.iter().filter(|p| p.curve == curve).collect();
+            if points.len() < 2 {
+                continue;
+            }
+            let at = |p: &Point| match curve {
+                "cameras" => p.cameras as f64,
+                "timesteps" => p.timesteps as f64,
+                _ => p.tokens as f64,
+            };
+            let axis = |label: &str| if curve == "tokens" { Axis::log(label) } else { Axis::linear(label) };
+            let line = |name: &str, drawn, ms: &dyn Fn(&Point) -> f64| Series {
+                name: name.into(),
+                points: points.iter().map(|p| (at(p), ms(p))).collect(),
+                drawn,
+            };
+            let speed = rate(&points);
+            panels.push(Panel {
+                title: format!("Cost of the network against {curve}"),
+                x: axis(curve),
+                y: axis("ms"),
+                series: vec![
+                    line("measured", Drawn::Line, &|p| p.network_ms),
+                    line("counted FLOPs", Drawn::Dashed, &|p| p.gflop / speed),
+                ],
+            });
+        }
+        plot::svg(&panels)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::timing::StageStats;
+
+    fn setting(name: &str, ms: f64, psnr: f64) -> Setting {
+        let stats = StageStats { p50: ms, p99: 2.0 * ms };
+        Setting {
+            model: "tiny".into(),
+            weights: "w".into(),
+            setting: name.into(),
+            dtype: "f32".into(),
+            skips: Vec::new(),
+            skipped: 0,
+            tokens: 1172,
+            gflop: 10.0,
+            gaussians: 1,
+            picture: [96, 64],
+            clips: 1,
+            step_ms: stats.clone(),
+            stages_ms: [("step".to_string(), stats)].into(),
+            peak_rss_mb: Some(100.0),
+            against: super::super::network::TRUTH,
+            figures: Figures { psnr: Some(psnr), epe3d: Some(0.5), ..Figures::default() },
+            bag_psnr: None,
+        }
+    }
+
+    #[test]
+    fn tables_are_even_and_the_picture_has_every_setting() {
+        let point = |tokens, gflop, network_ms| Point {
+            curve: "tokens",
+            timesteps: 4,
+            cameras: 3,
+            picture: [96, 64],
+            tokens,
+            gflop,
+            network_ms,
+        };
+        let report = Report {
+            settings: vec![setting("default", 100.0, 22.5), setting("int8", 60.0, 22.4)],
+            baselines: vec![Baseline { method: "static", figures: Figures { ms: Some(90.0), ..Figures::default() } }],
+            sizes: vec![point(404, 1.0, 12.0), point(10_388, 100.0, 1000.0)],
+            peer_pytorch: Some(serde_json::json!({"median_s": 26.6})),
+            ..Report::default()
+        };
+        let text = report.markdown("bench.svg");
+        for table in text.split("\n\n").filter(|part| part.starts_with('|')) {
+            let widths: Vec<usize> = table.lines().map(|l| l.matches('|').count()).collect();
+            assert!(widths.iter().all(|w| *w == widths[0]), "{table}");
+        }
+        assert!(text.contains("| 12.0 | 10.0 |"), "counted at the largest one's rate: {text}");
+        let svg = report.picture();
+        assert!(svg.contains("tiny, int8") && svg.contains("counted FLOPs") && !svg.contains("NaN"), "{svg}");
+        assert!(svg.contains("font-weight=\"bold\">1 tiny, default"), "the default is marked: {svg}");
+        assert!(!Report::default().picture().contains("NaN"));
+    }
+}
