@@ -217,8 +217,10 @@ impl StepMaker {
                 _ => return Err(e),
             },
         };
-        let poses: Vec<Rigid> = window.steps.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
-        let stamps_ns: Vec<i64> = window.steps.iter().map(|s| s.stamp_ns).collect();
+        // With `skip.newest_only` the scene has the window's last timestep alone.
+        let seen = &window.steps[window.steps.len().saturating_sub(scene.shape.timesteps)..];
+        let poses: Vec<Rigid> = seen.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
+        let stamps_ns: Vec<i64> = seen.iter().map(|s| s.stamp_ns).collect();
         let look = OverlapLook {
             stamps_ns: &stamps_ns,
             epoch: window.epoch,
@@ -245,7 +247,7 @@ impl StepMaker {
                 poses: &poses,
                 rendered: &views,
                 confidence: &agreement.geometry,
-                first_new: window.steps.len() - window.new_steps.min(window.steps.len()),
+                first_new: seen.len() - window.new_steps.min(seen.len()),
             };
             self.timings.time("map", || self.map.fuse_scene(&look));
         } else {
@@ -273,7 +275,7 @@ impl StepMaker {
 
     /// What moves, into the trajectories and the objects.
     fn follow(&mut self, scene: &Scene, window: &Window<Frame>, demand: Demand) {
-        let newest = window.steps.len() - 1;
+        let newest = scene.shape.timesteps - 1;
         if demand.tracks {
             let mut points = select::moving_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
             for p in &mut points {
