@@ -36,6 +36,24 @@ proptest! {
     }
 
     #[test]
+    fn attention_on_other_tokens_is_the_plain_one(
+        b in 1usize..3, n in 1usize..140, m in 1usize..300, heads in 1usize..4, d in 1usize..40, seed in 0u64..1000,
+        sized: bool,
+    ) {
+        let queries = noise(seed, &[b, n, heads * d], 2.0);
+        let both = noise(seed + 1, &[b, m, 2 * heads * d], 2.0);
+        let sizes: Vec<f32> = (0..m).map(|i| (1 + i % 4) as f32).collect();
+        let sizes = sized.then_some(&sizes[..]);
+        let want = plain::cross_attention(&queries, &both, sizes, heads).unwrap();
+        same(&cross_attention(&queries, &both, sizes, heads, Precision::F32).unwrap(), &want);
+        for precision in [Precision::Int16, Precision::Int8, Precision::Bf16] {
+            let got = cross_attention(&queries, &both, sizes, heads, precision).unwrap();
+            let worst = (got - &want).unwrap().abs().unwrap().flatten_all().unwrap().max(0).unwrap();
+            prop_assert!(worst.to_scalar::<f32>().unwrap() < 4e-2, "{}", precision);
+        }
+    }
+
+    #[test]
     fn linear_is_the_plain_one(
         b in 1usize..3, m in 1usize..120, n in 1usize..70, k in 1usize..300, seed in 0u64..1000,
         bias: bool, add: bool, act in 0usize..3,
@@ -133,5 +151,9 @@ fn wrong_shapes_are_errors() {
     assert!(mlp(&x, &layer(2, 8, 6, true), Activation::None, &layer(3, 4, 8, true), Some(&x)).is_err());
     assert!(attention(&noise(1, &[1, 5, 6], 1.0), 4).is_err());
     assert!(attention(&noise(1, &[1, 5, 6], 1.0), 0).is_err());
+    let (queries, both) = (noise(1, &[1, 5, 6], 1.0), noise(2, &[1, 4, 12], 1.0));
+    assert!(cross_attention(&queries, &both, None, 4, Precision::F32).is_err());
+    assert!(cross_attention(&queries, &both, Some(&[1.0; 5]), 2, Precision::F32).is_err());
+    assert!(cross_attention(&queries, &queries, None, 2, Precision::F32).is_err());
     assert!(layer_norm(&x, Some(&noise(1, &[5], 1.0)), None, 1e-6).is_err());
 }

@@ -82,6 +82,10 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         config.model.preset = preset.clone();
     }
     config.validate()?;
+    if config.skip.newest_only {
+        let text = "skip.newest_only = true: scoring wants the Gaussians of every timestep; leave it out";
+        return Err(UsageError(text.into()).into());
+    }
     let source = ModelSource::open(&config.model)?;
     let size = source.picture_size(&config.model)?;
     let data = Data::open(args, &config, size)?;

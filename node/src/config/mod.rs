@@ -96,7 +96,7 @@ section! {
         image_height: usize = 0,
         /// Threads for the network and the rasteriser; 0: all cores.
         threads: usize = 0,
-        /// Numbers of the transformer's products: `f32`, `bf16` (faster only on processors that have it), `int8` (integer products with exact sums; CPU).
+        /// Numbers of the transformer's products: `f32`, `int16` (whole numbers with exact sums), `int8` (the same, weights in 8 bits), `bf16` (rounded as bf16 units would; not faster). On a CPU; elsewhere as they are.
         precision: String = "f32".into(),
     }
 }
@@ -140,9 +140,9 @@ section! {
         kv_pool: usize = 1,
         /// Part of the image tokens merged into a neighbour of the same picture, 0 to 0.75; edges and what moves are kept longest. 0: off.
         merge: f64 = 0.0,
-        /// The last block and the heads work on the newest timestep alone: the map, flow and masks get that timestep's Gaussians only.
+        /// The last block and the heads work on the newest timestep alone: results are those of all, but only its Gaussians are there for the map and for drawing other times.
         newest_only: bool = false,
-        /// Patches that were sky in the last step, far from anything else, and have not changed are not computed.
+        /// Patches that were sky when last computed, far from anything else, and look the same are not computed (one window at a time: not with `--batch`).
         sky: bool = false,
         /// A patch is sky when no pixel of it was more opaque than this.
         sky_opacity: f64 = 0.05,

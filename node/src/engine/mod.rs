@@ -4,6 +4,7 @@ pub mod evaluate;
 pub mod figures;
 pub mod score;
 pub mod select;
+mod sky;
 #[cfg(test)]
 mod tests;
 pub mod truth;
@@ -15,14 +16,16 @@ use candle_core::Device;
 use storm_model::config::ModelConfig;
 use storm_model::scene::{RenderedView, Scene, Want};
 use storm_model::weights::{self, Tensors};
-use storm_model::{ClipBatch, PixelLayout, Shortcuts, Storm, ViewInput};
+use storm_model::{ClipBatch, ModelError, PixelLayout, Precision, Shortcuts, Storm, ViewInput};
 use storm_render::raster::{CpuRasterizer, RasterSettings};
 use storm_render::{Intrinsics, View};
+use tracing::warn;
 
 use crate::config::{ModelConfigSection, SkipConfig};
 use crate::rigid::Rigid;
 use crate::source::Frame;
 use crate::window::{PosedSet, Window, relative};
+use sky::SkyPatches;
 
 /// How the weights a run used are called in metrics.json and the report when there are none.
 pub const UNTRAINED: &str = "untrained";
@@ -112,6 +115,7 @@ pub struct Engine {
     timespan_sec: f64,
     weights: String,
     shortcuts: Shortcuts,
+    sky: SkyPatches,
 }
 
 impl Engine {
@@ -132,7 +136,11 @@ impl Engine {
         };
         let raster = CpuRasterizer::new(model.config().raster_settings())?;
         let shortcuts = Shortcuts { precision: section.precision.parse()?, ..Shortcuts::default() };
-        Ok(Self { model, raster, device, timespan_sec, weights, shortcuts })
+        if shortcuts.precision == Precision::Bf16 {
+            warn!("model.precision = bf16 rounds as bf16 units would, in f32 arithmetic: it is not faster than f32");
+        }
+        let sky = SkyPatches::new(&SkipConfig::default(), model.config().patch_size);
+        Ok(Self { model, raster, device, timespan_sec, weights, shortcuts, sky })
     }
 
     /// The same, leaving out what the configuration allows.
@@ -141,10 +149,11 @@ impl Engine {
         self.shortcuts.kv_pool = skip.kv_pool;
         self.shortcuts.merge = skip.merge as f32;
         self.shortcuts.newest_only = skip.newest_only;
+        self.sky = SkyPatches::new(skip, self.model.config().patch_size);
         self
     }
 
-    /// What the next steps leave out or round. A `keep` is set for each step anew.
+    /// What the next steps leave out or round. With `skip.sky` the engine makes a `keep` of its own for each step.
     pub fn set_shortcuts(&mut self, shortcuts: Shortcuts) {
         self.shortcuts = shortcuts;
     }
@@ -190,12 +199,32 @@ impl Engine {
     /// Windows whose shapes differ or that the network does not take.
     pub fn steps(&mut self, windows: &[&Window<Frame>], cameras: &[Intrinsics]) -> Result<Vec<Result<Scene>>> {
         let clips = windows.iter().map(|w| self.clip(w, cameras)).collect::<Result<Vec<_>>>()?;
-        let output = match clips.as_slice() {
-            [] => return Ok(Vec::new()),
-            [one] => self.model.forward_with(one, &self.shortcuts)?,
-            several => self.model.forward_with(&ClipBatch::stack(several)?, &self.shortcuts)?,
+        let output = match (clips.as_slice(), windows) {
+            ([], _) => return Ok(Vec::new()),
+            ([one], [window]) => {
+                let Some(keep) = self.sky.keep(window, cameras) else {
+                    let scene = self.model.forward_with(one, &self.shortcuts)?.scene(0);
+                    return Ok(vec![self.judged(window, scene, None)]);
+                };
+                let shortcuts = Shortcuts { keep: Some(keep), ..self.shortcuts.clone() };
+                let scene = self.model.forward_with(one, &shortcuts)?.scene(0);
+                return Ok(vec![self.judged(window, scene, shortcuts.keep.as_deref())]);
+            }
+            // What is left out differs from window to window: of several at once all patches are computed.
+            (several, _) => self.model.forward_with(&ClipBatch::stack(several)?, &self.shortcuts)?,
         };
         Ok((0..clips.len()).map(|i| Ok(output.scene(i)?)).collect())
+    }
+
+    fn judged(
+        &mut self,
+        window: &Window<Frame>,
+        scene: Result<Scene, ModelError>,
+        keep: Option<&[bool]>,
+    ) -> Result<Scene> {
+        let scene = scene?;
+        self.sky.judge(window, &scene, keep);
+        Ok(scene)
     }
 
     /// One window as the network takes it.

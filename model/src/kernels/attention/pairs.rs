@@ -262,7 +262,18 @@ fn block_logits<S: Simd, const MR: usize>(
             }
         }
     }
-    tops.map(|top| S::largest(top))
+    let mut largest = [0f32; MR];
+    for r in 0..MR {
+        largest[r] = S::largest(tops[r]);
+    }
+    largest
+}
+
+/// `2^(x - offset)` to the nearest whole number, which is in the low bits (a function, not a closure: see `kernels::math`).
+#[inline(always)]
+fn whole<S: Simd>(x: S::V, offset: S::V) -> S::V {
+    let x = S::max_of(S::splat(WEIGHTLESS), S::sub(x, offset));
+    S::add(exp2_rough::<S>(x), S::splat(ROUND))
 }
 
 /// Weights `2^(x - offset)` to the nearest whole number, as pairs across the vectors of each tile; returns their sum.
@@ -270,14 +281,11 @@ fn block_logits<S: Simd, const MR: usize>(
 fn quantised_weights<S: Simd>(logits: &[f32], offset: f32, tiles: usize, weights: &mut [f32]) -> f32 {
     let (offset, round) = (S::splat(offset), S::splat(ROUND));
     let mut sum = S::zero();
-    let whole = |x: S::V| {
-        let x = S::max_of(S::splat(WEIGHTLESS), S::sub(x, offset));
-        S::add(exp2_rough::<S>(x), round)
-    };
     for (logits, to) in logits.chunks_exact(2 * S::W).zip(weights.chunks_exact_mut(S::W)).take(tiles) {
         // SAFETY: two vectors of logits, one of pairs.
         unsafe {
-            let (low, high) = (whole(S::load(logits.as_ptr())), whole(S::load(logits.as_ptr().add(S::W))));
+            let low = whole::<S>(S::load(logits.as_ptr()), offset);
+            let high = whole::<S>(S::load(logits.as_ptr().add(S::W)), offset);
             sum = S::add(sum, S::add(S::sub(low, round), S::sub(high, round)));
             S::store(to.as_mut_ptr(), S::pair(low, high));
         }
