@@ -3,6 +3,7 @@
 
 pub mod demand;
 pub mod front;
+pub mod guard;
 pub mod live;
 pub mod messages;
 pub mod metrics;
