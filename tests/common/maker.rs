@@ -32,6 +32,8 @@ pub struct Maker {
     pub image: Edit<Image>,
     /// The images' bytes as written.
     pub bytes: Box<dyn Fn(usize, Vec<u8>) -> Vec<u8>>,
+    /// What the cameras' topics begin with.
+    pub prefix: String,
     /// Poses come as /tf instead of /odometry.
     pub tf: bool,
     /// Vehicle poses.
@@ -47,6 +49,7 @@ impl Default for Maker {
         Self {
             image: Box::new(|_, _| true),
             bytes: Box::new(|_, b| b),
+            prefix: String::new(),
             tf: false,
             pose: Box::new(|_, _| true),
             info: Box::new(|_, _| true),
@@ -81,7 +84,7 @@ impl Maker {
                 bag.write(poses, stamp(frame), &cdr.unwrap()).unwrap();
             }
             for camera in 0..2 {
-                let name = |what: &str| format!("/camera{camera}/{what}");
+                let name = |what: &str| format!("{}/camera{camera}/{what}", self.prefix);
                 let info_topic = bag.topic(&name("camera_info"), MessageType::CameraInfo, Qos::Reliable).unwrap();
                 let image_topic = bag.topic(&name("image"), MessageType::Image, Qos::Reliable).unwrap();
                 let mut k = info(camera, frame);

@@ -17,6 +17,7 @@ mod tests;
 mod topics;
 mod unpack;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -32,6 +33,9 @@ use problems::Problems;
 use sqlite::SqliteIndex;
 use topics::{FileTopic, FileTopics};
 use unpack::FileKind;
+
+/// Serializations that an error lists.
+const MOST_NAMED: usize = 8;
 
 /// One message as recorded.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -238,18 +242,17 @@ fn open_file(path: &Path, problems: &Problems) -> Result<(Storage, Option<NamedT
 
 /// Refuses a bag in which nothing can be read; notes the topics that cannot otherwise.
 fn refuse_other_serializations(path: &Path, topics: &[Topic], problems: &Problems) -> Result<(), BagError> {
-    let mut others: Vec<String> = Vec::new();
-    for t in topics.iter().filter(|t| !t.is_readable()) {
-        let named = format!("`{}`", t.serialization);
-        if !others.contains(&named) {
-            others.push(named);
-        }
-    }
+    let unreadable = topics.iter().filter(|t| !t.is_readable()).map(|t| t.serialization.as_str());
+    let others: BTreeSet<&str> = unreadable.collect();
     if others.is_empty() {
         return Ok(());
     }
     if topics.iter().all(|t| !t.is_readable()) {
-        let found = format!("serialization {} on all {} topics", others.join(", "), topics.len());
+        let mut named: Vec<String> = others.iter().take(MOST_NAMED).map(|s| format!("`{s}`")).collect();
+        if others.len() > MOST_NAMED {
+            named.push("...".to_owned());
+        }
+        let found = format!("serialization {} on all {} topics", named.join(", "), topics.len());
         return Err(BagError::Serialization { path: path.to_owned(), found });
     }
     for t in topics.iter().filter(|t| !t.is_readable()) {

@@ -4,8 +4,10 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use rusqlite::config::DbConfig;
+use rusqlite::limits::Limit;
 use rusqlite::types::ValueRef;
-use rusqlite::{Connection, OpenFlags};
+use rusqlite::{Connection, OpenFlags, OptionalExtension};
 use tempfile::TempDir;
 
 use super::FileMessage;
@@ -43,6 +45,10 @@ impl SqliteIndex {
             ("topics", &topic_columns, &["id", "name", "type"][..]),
             ("messages", &message_columns, &["topic_id", "timestamp", "data"]),
         ] {
+            if !columns.is_empty() && !is_plain_table(&db, table).map_err(BagError::sqlite(path))? {
+                let found = format!("an sqlite3 database whose `{table}` is a view or a virtual table");
+                return Err(BagError::NotABag { path: path.to_owned(), found });
+            }
             if let Some(missing) = needed.iter().find(|n| !columns.iter().any(|c| c == *n)) {
                 let found = match columns.as_slice() {
                     [] => format!("an sqlite3 database without a table `{table}`"),
@@ -185,7 +191,25 @@ fn connect(database: &Path, path: &Path) -> Result<Connection, BagError> {
     }
     uri.push_str("?immutable=1");
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_URI | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    Connection::open_with_flags(uri, flags).map_err(BagError::sqlite(path))
+    let db = Connection::open_with_flags(uri, flags).map_err(BagError::sqlite(path))?;
+    // A database is a program too: nothing in its schema may call functions with side effects, and no value may be larger
+    // than a message.
+    let guarded = || -> rusqlite::Result<()> {
+        db.set_db_config(DbConfig::SQLITE_DBCONFIG_DEFENSIVE, true)?;
+        db.set_db_config(DbConfig::SQLITE_DBCONFIG_TRUSTED_SCHEMA, false)?;
+        db.set_limit(Limit::SQLITE_LIMIT_LENGTH, i32::try_from(MAX_MESSAGE_BYTES).unwrap_or(i32::MAX))?;
+        Ok(())
+    };
+    guarded().map_err(BagError::sqlite(path))?;
+    Ok(db)
+}
+
+/// Whether `table` is rows in the file: a view may give rows without end, and what a virtual table does is up to a module.
+/// Neither has pages of its own.
+fn is_plain_table(db: &Connection, table: &str) -> rusqlite::Result<bool> {
+    let query = "SELECT rootpage FROM sqlite_schema WHERE type = 'table' AND name = ?1 COLLATE NOCASE";
+    let page: Option<i64> = db.query_row(query, [table], |r| r.get(0)).optional()?;
+    Ok(page.is_some_and(|page| page > 0))
 }
 
 fn columns(db: &Connection, table: &str) -> rusqlite::Result<Vec<String>> {

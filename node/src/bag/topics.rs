@@ -1,5 +1,7 @@
 //! Topics: their names, their types in one spelling, their counts.
 
+use std::collections::HashMap;
+
 /// A topic of a bag.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Topic {
@@ -25,29 +27,32 @@ pub(crate) type FileTopic = Topic;
 
 /// Collects topics, one per name, type and serialization.
 #[derive(Debug, Default)]
-pub(crate) struct FileTopics(Vec<Topic>);
+pub(crate) struct FileTopics {
+    topics: Vec<Topic>,
+    /// A file decides how many there are.
+    known: HashMap<[String; 3], usize>,
+}
 
 impl FileTopics {
     /// Index of a topic, added when it is new.
     pub fn index(&mut self, name: &str, type_name: &str, serialization: &str) -> usize {
-        let type_name = normalized_type(type_name);
-        let same = |t: &Topic| t.name == name && t.type_name == type_name && t.serialization == serialization;
-        if let Some(i) = self.0.iter().position(same) {
-            return i;
-        }
-        self.0.push(Topic { name: name.to_owned(), type_name, serialization: serialization.to_owned(), count: 0 });
-        self.0.len() - 1
+        let key = [name.to_owned(), normalized_type(type_name), serialization.to_owned()];
+        *self.known.entry(key).or_insert_with_key(|[name, type_name, serialization]| {
+            let (name, type_name, serialization) = (name.clone(), type_name.clone(), serialization.clone());
+            self.topics.push(Topic { name, type_name, serialization, count: 0 });
+            self.topics.len() - 1
+        })
     }
 
     /// Adds messages to a topic.
     pub fn count(&mut self, index: usize, messages: u64) {
-        if let Some(t) = self.0.get_mut(index) {
+        if let Some(t) = self.topics.get_mut(index) {
             t.count = t.count.saturating_add(messages);
         }
     }
 
     pub fn into_vec(self) -> Vec<Topic> {
-        self.0
+        self.topics
     }
 }
 

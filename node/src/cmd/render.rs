@@ -213,8 +213,9 @@ fn renderer(device: &str) -> Result<Box<dyn Renderer>> {
     }
     #[cfg(feature = "wgpu")]
     {
-        use storm_render::gpu::{GpuOptions, GpuRasterizer};
-        Ok(Box::new(GpuRasterizer::new(settings, &GpuOptions::default())?))
+        use storm_render::gpu::{GpuOptions, GpuOrCpu, GpuRasterizer};
+        let gpu = GpuRasterizer::new(settings, &GpuOptions::default())?;
+        Ok(Box::new(GpuOrCpu::new(gpu, Box::new(|e| tracing::warn!("{e}; going on with the CPU")))?))
     }
     #[cfg(not(feature = "wgpu"))]
     Err(UsageError("--device wgpu: this program was built without it; cargo build --release --features wgpu".into())

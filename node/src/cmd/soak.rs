@@ -7,7 +7,7 @@ use storm_render::world::DriveOptions;
 
 use super::{Outcome, UsageError, progress_bar};
 use crate::config::Config;
-use crate::soak::{OracleErrors, SoakOptions, SoakReport, run as soak};
+use crate::soak::{FaultReport, FaultSoak, OracleErrors, SoakOptions, SoakReport, run as soak, run_with_faults};
 
 /// Arguments of `storm soak`.
 #[derive(Debug, clap::Args)]
@@ -48,6 +48,11 @@ pub struct Args {
     /// Threads; 0: all cores.
     #[arg(long, default_value_t = 0)]
     threads: usize,
+    /// Through the live pipeline with its network, and with faults of all kinds: cameras that miss, messages late, twice,
+    /// out of order and broken, poses that jump, clocks too, a full and a slow disk, panics. Fails when a count does not
+    /// add up.
+    #[arg(long)]
+    faults: bool,
     /// Write everything as JSON.
     #[arg(long)]
     json: Option<PathBuf>,
@@ -84,6 +89,11 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     };
     let temporary = tempfile::tempdir().context("no temporary folder")?;
     let map_dir = args.map.clone().unwrap_or_else(|| temporary.path().to_path_buf());
+    if args.faults {
+        let drive = DriveOptions { exposure: true, noise: 1.5, ..drive };
+        let map_dir = if args.map.is_some() { map_dir } else { map_dir.join("map") };
+        return with_faults(args, FaultSoak { drive, config, map_dir, disk: true }, progress);
+    }
     let options = SoakOptions { drive, errors, quality: !args.no_quality, map_dir: Some(map_dir), config };
     let bar = progress_bar(progress, (args.seconds * args.rate) as u64, "driving");
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build()?;
@@ -95,6 +105,61 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         std::fs::write(path, json + "\n").with_context(|| format!("cannot write {}", path.display()))?;
     }
     Ok(Outcome::Done)
+}
+
+fn with_faults(args: &Args, options: FaultSoak, progress: bool) -> Result<Outcome> {
+    if args.threads > 0 {
+        // Fails only when a pool was set up before in this process; then that one is kept.
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build_global();
+    }
+    let bar = progress_bar(progress, (args.seconds * args.rate) as u64, "driving");
+    let report = run_with_faults(&options, &|done| bar.set_position(done as u64))?;
+    bar.finish_and_clear();
+    print_faults(&report);
+    if let Some(path) = &args.json {
+        let json = serde_json::to_string_pretty(&report)?;
+        std::fs::write(path, json + "\n").with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    Ok(if report.holds() { Outcome::Done } else { Outcome::Lost })
+}
+
+fn print_faults(r: &FaultReport) {
+    println!("seed {}: {:.0} s in {:.0} s; faults {:?}", r.seed, r.seconds, r.wall_sec, r.injected);
+    println!("{} images sent, {} used, dropped {:?}", r.images_sent, r.images_used, r.dropped);
+    println!(
+        "{} sets, {} steps ({} not computed), {} published, {:.0} MB; {} windows lost to panics, {} clock jumps, {} poses refused",
+        r.sets,
+        r.steps,
+        r.steps_skipped,
+        r.published,
+        r.published_bytes as f64 / 1e6,
+        r.panicked_steps,
+        r.epochs,
+        r.poses_rejected
+    );
+    println!(
+        "map: {} Gaussians saved, {} tiles put to disk, {} Gaussians given up, {} tiles refused by the disk, {} tiles lost, {} saves failed",
+        r.saved_gaussians, r.spilled, r.evicted, r.spill_failed, r.tiles_lost, r.failed_saves
+    );
+    println!("quarter  resident MB (mean, most)   steps   latency ms (p50, p99, most)   map Gaussians   on disk MB");
+    for (i, q) in r.quarters.iter().enumerate() {
+        println!(
+            "{:7}  {:12.1} {:11.1}   {:5}   {:8.1} {:8.1} {:8.1}   {:13}   {:10.1}",
+            i + 1,
+            q.rss_mb[0],
+            q.rss_mb[1],
+            q.steps,
+            q.latency_ms[0],
+            q.latency_ms[1],
+            q.latency_ms[2],
+            q.map_gaussians,
+            q.map_disk_mb
+        );
+    }
+    println!("last quarter against the second: resident {:+.1} %", 100.0 * r.memory_growth);
+    for c in &r.checks {
+        println!("{:9} {}: {} = {}", if c.ok { "holds" } else { "DOES NOT" }, c.what, c.left, c.right);
+    }
 }
 
 fn print(r: &SoakReport) {

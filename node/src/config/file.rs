@@ -128,6 +128,20 @@ mod tests {
         }
     }
 
+    /// Aliases of aliases, ten at a time, and brackets without end: small texts that would be large values.
+    #[test]
+    fn texts_that_explode_are_refused() {
+        let mut bomb = String::from("a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n");
+        for i in 1..9 {
+            bomb += &format!("a{i}: &a{i} [{}]\n", vec![format!("*a{}", i - 1); 10].join(", "));
+        }
+        bomb += "input: *a8\n";
+        for text in [bomb, "input: {images: ".to_owned() + &"[".repeat(100_000), "[".repeat(100_000)] {
+            assert!(matches!(Config::from_yaml(&text), Err(ConfigError::Parse { .. })));
+            assert!(Config::default().with_override(&format!("input.images={text}")).is_err());
+        }
+    }
+
     #[test]
     fn ros_parameter_files_are_read() {
         let c = Config::from_yaml("/**:\n  ros__parameters:\n    window:\n      stride_sec: 0.25\n").unwrap();

@@ -18,6 +18,18 @@ const MAX_DECODER_BYTES: u64 = 1 << 30;
 /// # Errors
 /// Neither JPEG nor PNG, a damaged file, or one that claims more than it may.
 pub fn compressed_to_rgb(message: &CompressedImage) -> Result<RgbPicture, DecodeError> {
+    compressed_of_size(message, None)
+}
+
+/// The same for a camera whose pictures are `expected` wide and high: a file that claims another size is refused by its
+/// header, before there is memory for it.
+///
+/// # Errors
+/// As [`compressed_to_rgb`], and another size.
+pub fn compressed_of_size(
+    message: &CompressedImage,
+    expected: Option<(usize, usize)>,
+) -> Result<RgbPicture, DecodeError> {
     let wrong =
         |why: String| DecodeError::Compressed { format: message.format.clone(), bytes: message.data.len(), why };
     if message.format.contains("compressedDepth") {
@@ -28,6 +40,14 @@ pub fn compressed_to_rgb(message: &CompressedImage) -> Result<RgbPicture, Decode
         _ if message.data.is_empty() => return Err(wrong("it is empty".to_owned())),
         _ => return Err(wrong("neither JPEG nor PNG; only these are accepted".to_owned())),
     };
+    if let Some((want_width, want_height)) = expected {
+        let header = ImageReader::with_format(Cursor::new(&message.data), format);
+        let (width, height) = header.into_dimensions().map_err(|e| wrong(e.to_string()))?;
+        let (width, height) = (width as usize, height as usize);
+        if (width, height) != (want_width, want_height) {
+            return Err(DecodeError::Size { width, height, want_width, want_height });
+        }
+    }
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE);
     limits.max_image_height = Some(MAX_SIDE);
@@ -83,6 +103,16 @@ mod tests {
         let sof = jpeg.data.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
         jpeg.data[sof + 5..sof + 9].copy_from_slice(&[0xff, 0xff, 0xff, 0xff]);
         assert!(compressed_to_rgb(&jpeg).is_err());
+
+        // 200 megapixels of nothing: within every limit, but not what this camera sends.
+        let mut large = encode(RgbImage::new(4, 4), ImageFormat::Png);
+        large.data[16..24].copy_from_slice(&[0, 0, 0x40, 0, 0, 0, 0x30, 0]);
+        let crc = crc32fast::hash(&large.data[12..29]).to_be_bytes();
+        large.data[29..33].copy_from_slice(&crc);
+        let e = compressed_of_size(&large, Some((4, 4))).unwrap_err();
+        assert!(matches!(e, DecodeError::Size { width: 16384, height: 12288, want_width: 4, want_height: 4 }), "{e}");
+        let whole = encode(RgbImage::new(4, 4), ImageFormat::Jpeg);
+        assert_eq!(compressed_of_size(&whole, Some((4, 4))).unwrap(), compressed_to_rgb(&whole).unwrap());
 
         for (data, says) in
             [(vec![], "empty"), (b"GIF89a....".to_vec(), "neither JPEG nor PNG"), (vec![0xff, 0xd8, 0xff], "bytes")]

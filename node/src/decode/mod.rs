@@ -15,7 +15,7 @@ mod rows;
 mod warp;
 
 pub use color::image_to_rgb;
-pub use compressed::compressed_to_rgb;
+pub use compressed::{compressed_of_size, compressed_to_rgb};
 pub use error::DecodeError;
 pub use lens::Lens;
 pub use measure::{image_to_depth, image_to_labels, image_to_vectors};

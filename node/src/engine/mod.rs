@@ -163,6 +163,15 @@ impl Engine {
         &self.shortcuts
     }
 
+    /// Makes anew all that a step changes: the rasteriser and its buffers. The network only ever reads its weights.
+    ///
+    /// # Errors
+    /// None that [`Engine::new`] would not have met.
+    pub fn restart(&mut self) -> Result<()> {
+        self.raster = CpuRasterizer::new(self.model.config().raster_settings())?;
+        Ok(())
+    }
+
     /// The network's configuration.
     pub fn model_config(&self) -> &ModelConfig {
         self.model.config()

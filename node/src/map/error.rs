@@ -37,6 +37,9 @@ pub enum MapError {
         /// What was asked for.
         wanted: f64,
     },
+    /// The save broke off.
+    #[error("saving the map panicked: {0}; the last save stays whole")]
+    Panicked(String),
     /// An output around it failed.
     #[error(transparent)]
     Output(#[from] OutputError),

@@ -118,7 +118,12 @@ fn cell(w: &[u32; WORDS]) -> Option<Cell> {
         weight: f(16),
         support: f(17),
     };
-    let sound = level_of(c.key) < LEVELS
+    is_sound(&c).then_some(c)
+}
+
+/// Whether all numbers of a cell are ones that the map writes.
+pub(super) fn is_sound(c: &Cell) -> bool {
+    level_of(c.key) < LEVELS
         && c.position.is_finite()
         && c.cov.iter().all(|x| x.is_finite())
         && c.color.is_finite()
@@ -126,8 +131,7 @@ fn cell(w: &[u32; WORDS]) -> Option<Cell> {
         && c.weight > 0.0
         && c.weight <= MAX_WEIGHT
         && c.support > 0.0
-        && c.support <= SUPPORT_MAX;
-    sound.then_some(c)
+        && c.support <= SUPPORT_MAX
 }
 
 /// A tile's file, and the checksum of its payload.

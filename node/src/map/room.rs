@@ -1,8 +1,12 @@
 //! Staying within the caps: far tiles go to disk, and when that is not allowed or does not work, the least confident
 //! Gaussians go.
 
+use std::collections::HashSet;
+
 use glam::DVec3;
 
+use super::format::is_sound;
+use super::fuse::Jobs;
 use super::tile::Tile;
 use super::{MapCounts, StaticMap};
 
@@ -84,6 +88,25 @@ impl StaticMap {
             gaussians = gaussians.saturating_sub(tile.len());
             bytes = bytes.saturating_sub(tile.bytes());
             self.take_out(at as usize);
+        }
+    }
+
+    /// Makes the map whole again after a call that broke off in the middle (a panic that was caught): tables are built anew
+    /// from the cells, cells whose numbers are not whole go, and a tile whose cells contradict each other goes back to its
+    /// last saved version, or is lost and counted.
+    pub fn recover(&mut self) {
+        self.jobs = Jobs::default();
+        self.by_index.clear();
+        for mut old in std::mem::take(&mut self.tiles) {
+            let mut keys = HashSet::new();
+            old.cells.retain(|c| is_sound(c) && keys.insert(c.key));
+            let mut tile = Tile::with_cells(old.index, self.config.voxel_m, old.cells);
+            (tile.revision, tile.stamp_ns) = (self.revision, old.stamp_ns);
+            if tile.is_consistent() && !self.by_index.contains_key(&tile.index) {
+                self.insert_tile(tile);
+            } else {
+                self.counts.tiles_lost += 1;
+            }
         }
     }
 

@@ -326,7 +326,6 @@ impl Tile {
     }
 
     /// True when cells and table agree; for tests.
-    #[cfg(test)]
     pub fn is_consistent(&self) -> bool {
         self.live().count() == self.len()
             && self.cells.iter().enumerate().filter(|(_, c)| c.support > 0.0).all(|(i, c)| {

@@ -131,6 +131,12 @@ impl ObjectTracker {
         self.counts
     }
 
+    /// Ends all objects; the next step starts new ones.
+    pub fn end_all(&mut self) {
+        self.end_where(|_| true);
+        self.epoch = None;
+    }
+
     fn end_where(&mut self, ended: impl Fn(&MovingObject) -> bool) {
         let config = &self.config;
         for object in self.live.extract_if(.., |o| ended(o)) {

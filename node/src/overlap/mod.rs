@@ -98,6 +98,12 @@ impl Overlap {
         Self { config: config.clone(), epoch: None, seen: VecDeque::new(), counts: OverlapCounts::default() }
     }
 
+    /// Forgets what was seen; the counts stay.
+    pub fn reset(&mut self) {
+        self.seen.clear();
+        self.epoch = None;
+    }
+
     /// What was found so far.
     pub fn counts(&self) -> OverlapCounts {
         self.counts

@@ -15,6 +15,7 @@ use crate::sync::clock::unsigned_ns;
 use crate::sync::{DropCounts, DropReason, Synchronizer};
 use crate::window::{PosedSet, Window, WindowBuilder, WindowCounts};
 
+use super::guard::caught;
 use super::posed::{PoseStage, PoseStore};
 
 /// One ground-truth image with its size.
@@ -67,6 +68,9 @@ pub struct Front {
     /// Sets kept since the last window was asked for.
     fresh: u64,
     superseded: u64,
+    /// Images in sets that were handed on.
+    used: u64,
+    panics: u64,
 }
 
 impl Front {
@@ -87,6 +91,8 @@ impl Front {
             each_set: true,
             fresh: 0,
             superseded: 0,
+            used: 0,
+            panics: 0,
         }
     }
 
@@ -123,7 +129,8 @@ impl Front {
         self.sync.reset();
         self.window.reset();
         self.posed.clear();
-        (self.now_ns, self.epoch, self.fresh) = (None, self.sync.epoch(), 0);
+        self.superseded += std::mem::take(&mut self.fresh);
+        (self.now_ns, self.epoch) = (None, self.sync.epoch());
     }
 
     /// Least time between two windows from now on, seconds.
@@ -136,8 +143,20 @@ impl Front {
         &self.active
     }
 
-    /// Takes one event and gives what became ready, in order.
+    /// Takes one event and gives what became ready, in order. A panic on the way starts sync, window and poses anew; what they
+    /// held is counted as lost to it.
     pub fn take(&mut self, event: Event, out: &mut VecDeque<FrontOutput>) {
+        let Err(what) = caught(|| self.take_in(event, out)) else { return };
+        self.panics += 1;
+        warn!("synchronisation panicked ({what}) and starts anew; this is a fault of the program, please report it");
+        self.reset();
+        let known = self.used + self.drops().total() + (self.sync.pending() + self.posed.pending()) as u64;
+        self.lost.add(DropReason::Panic, self.images_in().saturating_sub(known));
+    }
+
+    fn take_in(&mut self, event: Event, out: &mut VecDeque<FrontOutput>) {
+        #[cfg(test)]
+        tests::fail(&event);
         match event {
             Event::Image { camera, stamp_ns, frame } => match self.active.iter().position(|&c| c == camera) {
                 Some(camera) => {
@@ -193,7 +212,8 @@ impl Front {
     /// The window that ends at the newest set, if there is one and it was not given yet.
     pub fn newest_window(&mut self) -> Option<Window<Frame>> {
         let fresh = std::mem::take(&mut self.fresh);
-        if fresh == 0 {
+        if fresh == 0 || self.window.history() == 0 {
+            self.superseded += fresh;
             return None;
         }
         // Every set but the newest goes without, whether or not the newest ends a window; that one the builder counts.
@@ -206,6 +226,8 @@ impl Front {
         self.sync.flush();
         self.drain(out);
         self.posed.flush();
+        // Nobody will ask for a window any more.
+        self.superseded += std::mem::take(&mut self.fresh);
     }
 
     fn drain(&mut self, out: &mut VecDeque<FrontOutput>) {
@@ -214,6 +236,7 @@ impl Front {
             self.posed.push_set(set);
         }
         while let Some(set) = self.now_ns.and_then(|now_ns| self.posed.pop(now_ns)) {
+            self.used += set.frames.len() as u64;
             // Pictures are shared, so the copy is cheap.
             out.push_back(FrontOutput::Set(Arc::new(set.clone())));
             if !self.each_set {
@@ -237,6 +260,11 @@ impl Front {
     /// Images that arrived, readable or not.
     pub fn images_in(&self) -> u64 {
         self.sync.images_in() + self.lost.total()
+    }
+
+    /// Images in the sets that were handed on.
+    pub fn images_used(&self) -> u64 {
+        self.used
     }
 
     /// Everything dropped so far, by reason, over all stages.
@@ -267,6 +295,11 @@ impl Front {
         self.superseded
     }
 
+    /// Times a stage of it panicked and started anew.
+    pub fn panics(&self) -> u64 {
+        self.panics
+    }
+
     /// The number of clock jumps and resets so far.
     pub fn epoch(&self) -> u32 {
         self.epoch
@@ -275,5 +308,55 @@ impl Front {
     /// The pose stage, for turning camera poses into vehicle poses.
     pub fn base_pose(&self, camera: usize, map_from_camera: &Rigid) -> Rigid {
         self.posed.base_pose(camera, map_from_camera)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::decode::RgbPicture;
+    use crate::source::world::posed_set;
+    use storm_render::world::{Drive, DriveOptions};
+
+    /// What a test sends to have the stage panic.
+    const FAIL: &str = "fail";
+
+    pub(super) fn fail(event: &Event) {
+        if let Event::Lost { detail, .. } = event {
+            assert_ne!(detail, FAIL);
+        }
+    }
+
+    #[test]
+    fn a_panic_loses_what_waited_and_every_image_is_accounted_for() {
+        let options = DriveOptions { seconds: 1.0, cameras: 1, width: 16, height: 8, ..DriveOptions::default() };
+        let rig = crate::pipeline::live::tests::rig(2);
+        let config = Config::default();
+        let mut front = Front::new(&config, &rig, PoseStore::nothing(&config.sync));
+        let (set, _) = posed_set(&Drive::new(&options).unwrap(), 0);
+        let map_from_base = set.frames[0].map_from_camera;
+        let frame = Frame { rgb: Arc::new(RgbPicture { width: 1, height: 1, data: vec![0; 3] }) };
+        let mut out = VecDeque::new();
+        let mut feed = |front: &mut Front, range: std::ops::Range<i64>, cameras: &[usize]| {
+            for i in range {
+                let stamp_ns = i * 100_000_000;
+                front.take(Event::Pose { stamp_ns, map_from_base }, &mut out);
+                for &camera in cameras {
+                    front.take(Event::Image { camera, stamp_ns, frame: frame.clone() }, &mut out);
+                }
+            }
+            std::mem::take(&mut out).iter().filter(|o| matches!(o, FrontOutput::Set(_))).count() as u64
+        };
+        let mut sets = feed(&mut front, 0..5, &[0, 1]);
+        // Camera 1's picture is missing: camera 0's waits when the stage panics.
+        sets += feed(&mut front, 5..6, &[0]);
+        let detail = FAIL.to_owned();
+        front.take(Event::Lost { camera: None, reason: DropReason::Decode, detail }, &mut VecDeque::new());
+        assert_eq!((front.panics(), front.epoch()), (1, 1));
+        sets += feed(&mut front, 6..12, &[0, 1]);
+        let mut rest = VecDeque::new();
+        front.finish(&mut rest);
+        assert_eq!((sets, front.images_in()), (11, 23));
+        assert_eq!(front.drops().total(), 1, "{}", front.drops());
     }
 }

@@ -29,6 +29,8 @@ pub struct Counts {
     pub poses_rejected: u64,
     /// Windows whose result was not finite.
     pub non_finite_windows: u64,
+    /// Stages that panicked and were started anew.
+    pub stage_panics: u64,
     /// What could not be read.
     pub problems: Vec<String>,
 }
@@ -44,6 +46,7 @@ impl Counts {
             messages_lost: front.messages_lost(),
             poses_rejected: front.poses_rejected(),
             non_finite_windows: finished.non_finite_windows,
+            stage_panics: finished.panics + front.panics(),
             problems,
         }
     }
@@ -74,6 +77,9 @@ pub struct Metrics {
     pub poses_rejected: u64,
     /// Windows dropped because the network's result was not finite.
     pub non_finite_windows: u64,
+    /// Times a stage panicked and was started anew; each lost the window or the images it had. Never anything but 0, unless
+    /// the program has a fault.
+    pub stage_panics: u64,
     /// Non-finite values in the published clouds and depth pictures, counted as they are written (the file writers refuse
     /// them). Never anything but 0.
     pub nonfinite: u64,
@@ -131,6 +137,7 @@ impl Metrics {
             + self.nonfinite
             + self.poses_rejected
             + self.non_finite_windows
+            + self.stage_panics
             + self.withheld
             + self.map_evicted
             + self.map_saves_failed
@@ -149,6 +156,7 @@ impl Metrics {
             (self.nonfinite, "non-finite values published"),
             (self.poses_rejected, "poses refused"),
             (self.non_finite_windows, "windows not finite"),
+            (self.stage_panics, "panics of a stage"),
             (self.withheld, "points withheld"),
             (self.map_evicted, "map Gaussians evicted"),
             (self.map_saves_failed, "saves of the map failed"),

@@ -3,6 +3,7 @@
 
 pub mod demand;
 pub mod front;
+pub mod guard;
 pub mod live;
 pub mod map_updates;
 pub mod messages;

@@ -151,6 +151,11 @@ impl<T> PoseStage<T> {
         Self { gate: PoseGate::after(config, drops), base_from_camera, ..self }
     }
 
+    /// Images that wait.
+    pub fn pending(&self) -> usize {
+        self.gate.pending()
+    }
+
     /// Images dropped here, by reason.
     pub fn drops(&self) -> &DropCounts {
         self.gate.drops()

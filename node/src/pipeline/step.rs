@@ -27,6 +27,7 @@ use crate::tracks::{Track, TrackCounts, Tracker};
 use crate::window::Window;
 
 use super::demand::Demand;
+use super::guard::{MOST_IN_A_ROW, StagePanics, caught};
 use super::timing::Timings;
 
 /// A surface the map has seen at one place for this long stands, whatever a network under fast ego motion says of its
@@ -34,6 +35,42 @@ use super::timing::Timings;
 const STANDS_SEC: f64 = 1.0;
 /// Stamps remembered of sets the map was given: those of a window's length at 100 Hz.
 const FUSED_KEPT: usize = 512;
+
+/// A part of a step, in order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Deciding whether to compute.
+    Gate,
+    /// The network.
+    Network,
+    /// Comparing with earlier windows.
+    Overlap,
+    /// Drawing.
+    Draw,
+    /// Adding to the map.
+    Map,
+    /// Trajectories and objects.
+    Follow,
+    /// Saving the map.
+    Save,
+}
+
+impl Part {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Gate => "gate",
+            Self::Network => "network",
+            Self::Overlap => "overlap",
+            Self::Draw => "drawing",
+            Self::Map => "map",
+            Self::Follow => "tracking",
+            Self::Save => "saving",
+        }
+    }
+}
+
+/// Called as each part begins: where tests and `storm soak --faults` wait or panic.
+pub type OnPart = Box<dyn FnMut(Part) + Send>;
 
 /// What one step gives.
 pub struct Step {
@@ -81,6 +118,10 @@ pub struct StepMaker {
     fused: VecDeque<i64>,
     steps: u64,
     non_finite: u64,
+    part: Part,
+    on_part: Option<OnPart>,
+    panics: u64,
+    panics_in_a_row: u32,
 }
 
 /// A prediction of a window from the last computed one.
@@ -128,6 +169,10 @@ impl StepMaker {
             fused: VecDeque::new(),
             steps: 0,
             non_finite: 0,
+            part: Part::Gate,
+            on_part: None,
+            panics: 0,
+            panics_in_a_row: 0,
         })
     }
 
@@ -168,6 +213,61 @@ impl StepMaker {
         self.non_finite
     }
 
+    /// Windows lost because a part of the step panicked.
+    pub fn panics(&self) -> u64 {
+        self.panics
+    }
+
+    /// Has `on_part` called as each part of a step begins.
+    pub fn set_on_part(&mut self, on_part: OnPart) {
+        self.on_part = Some(on_part);
+    }
+
+    fn enter(&mut self, part: Part) {
+        self.part = part;
+        if let Some(on_part) = &mut self.on_part {
+            on_part(part);
+        }
+    }
+
+    /// Runs parts of a step. When one panics, what it may have left half done is made anew and the window is dropped,
+    /// counted and said.
+    fn guarded<T>(&mut self, stamp_ns: i64, parts: impl FnOnce(&mut Self) -> Result<T>) -> Result<Option<T>> {
+        match caught(|| parts(self)) {
+            Ok(done) => {
+                self.panics_in_a_row = 0;
+                done.map(Some)
+            }
+            Err(what) => {
+                self.panics += 1;
+                self.panics_in_a_row += 1;
+                let (stage, times) = (self.part.name(), self.panics_in_a_row);
+                warn!("window at {stamp_ns} ns dropped: the {stage} stage panicked ({what}) and starts anew");
+                self.rebuild()?;
+                if times >= MOST_IN_A_ROW {
+                    return Err(StagePanics { stage, times, what }.into());
+                }
+                Ok(None)
+            }
+        }
+    }
+
+    /// Makes anew what the present part changes.
+    fn rebuild(&mut self) -> Result<()> {
+        self.skipper.reset();
+        match self.part {
+            Part::Gate => {}
+            Part::Network | Part::Draw => self.engine.restart()?,
+            Part::Overlap => self.overlap.reset(),
+            Part::Map | Part::Save => self.map.recover(),
+            Part::Follow => {
+                self.tracker.end_all();
+                self.objects.end_all();
+            }
+        }
+        Ok(())
+    }
+
     /// Steps that were not computed, and how the checks of them went.
     pub fn skips(&self) -> SkipCounts {
         self.skipper.counts()
@@ -186,6 +286,12 @@ impl StepMaker {
     /// The same, with no more than `demand` asks for. A window that shows what the last computed one showed takes its result, one
     /// that it explains once moved on takes it extrapolated (see [`crate::gate`]).
     pub fn run_for(&mut self, window: Window<Frame>, demand: Demand) -> Result<Option<Step>> {
+        let stamp_ns = window.stamp_ns;
+        Ok(self.guarded(stamp_ns, |s| s.run_parts(window, demand))?.flatten())
+    }
+
+    fn run_parts(&mut self, window: Window<Frame>, demand: Demand) -> Result<Option<Step>> {
+        self.enter(Part::Gate);
         let plan = self.timings.time("gate", || self.skipper.plan(&window, demand));
         let shadow = match plan {
             Plan::Reuse(again) => return Ok(Some(self.again(window, again, demand))),
@@ -209,6 +315,7 @@ impl StepMaker {
             Plan::Compute { shadow } => shadow,
         };
         let start = Instant::now();
+        self.enter(Part::Network);
         // What a skipped step is compared with leaves nothing out.
         let verdict = match shadow {
             None if !self.engine.shortcuts().exact() => self.skipper.may_approximate(),
@@ -289,15 +396,26 @@ impl StepMaker {
         let start = Instant::now();
         let shortcuts = self.engine.shortcuts().clone();
         self.engine.set_shortcuts(Shortcuts::default());
-        let scenes = self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras);
+        let together = caught(|| {
+            self.enter(Part::Network);
+            self.engine.steps(&windows.iter().collect::<Vec<_>>(), &self.cameras)
+        });
         self.engine.set_shortcuts(shortcuts);
-        let scenes = scenes?;
-        let network_ms = start.elapsed().as_secs_f64() * 1e3 / windows.len() as f64;
+        let scenes = match together {
+            Ok(scenes) => scenes?,
+            Err(what) => {
+                warn!("the network panicked over {} windows at once ({what}); they are run one by one", windows.len());
+                self.rebuild()?;
+                return windows.into_iter().map(|w| self.run(w).map(|step| self.result(step))).collect();
+            }
+        };
+        let ms = start.elapsed().as_secs_f64() * 1e3 / windows.len() as f64;
         let all = windows.into_iter().zip(scenes);
         all.map(|(window, scene)| {
-            let ran = Ran { scene, ms: network_ms, approximate: false };
-            let step = self.take_in(window, ran, Demand::ALL, None)?;
-            Ok(self.result(step))
+            let stamp_ns = window.stamp_ns;
+            let ran = Ran { scene, ms, approximate: false };
+            let step = self.guarded(stamp_ns, |s| s.take_in(window, ran, Demand::ALL, None))?;
+            Ok(self.result(step.flatten()))
         })
         .collect()
     }
@@ -332,6 +450,7 @@ impl StepMaker {
         let given = &window.steps[window.steps.len() - scene.shape.timesteps.min(window.steps.len())..];
         let poses: Vec<Rigid> = given.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
         let stamps_ns: Vec<i64> = given.iter().map(|s| s.stamp_ns).collect();
+        self.enter(Part::Overlap);
         let look = OverlapLook {
             stamps_ns: &stamps_ns,
             epoch: window.epoch,
@@ -342,6 +461,7 @@ impl StepMaker {
         let agreement = self.timings.time("overlap", || self.overlap.step(&mut scene, &look));
         let newest = window.steps.len() - 1;
         let views = if demand.drawn() || self.skipper.wants_views() {
+            self.enter(Part::Draw);
             let targets = views_of(&window.steps[newest], &window.map_from_anchor, &self.cameras);
             let time_sec = newest_time_sec(&window);
             let want = Want { flow: true, motion: demand.motion };
@@ -349,6 +469,7 @@ impl StepMaker {
         } else {
             Vec::new()
         };
+        self.enter(Part::Map);
         if demand.map {
             let first_new = self.first_new(&stamps_ns);
             let look = SceneLook {
@@ -367,6 +488,7 @@ impl StepMaker {
             self.map.set_origin(window.map_from_anchor.translation);
         }
         let (scene, views, agreement) = (Arc::new(scene), Arc::from(views), Arc::new(agreement));
+        self.enter(Part::Gate);
         let computed = Computed { window, scene, views, agreement, demand, approximate };
         self.skipper.computed(&computed, shadow);
         self.follow(&computed.scene, &computed.window, demand);
@@ -398,6 +520,7 @@ impl StepMaker {
 
     /// What moves, into the trajectories and the objects.
     fn follow(&mut self, scene: &Scene, window: &Window<Frame>, demand: Demand) {
+        self.enter(Part::Follow);
         let newest = scene.shape.timesteps - 1;
         if demand.tracks {
             let mut points = select::moving_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
@@ -438,10 +561,20 @@ impl StepMaker {
     /// # Errors
     /// A file that cannot be written; the last save stays whole.
     pub fn save_map(&mut self) -> Result<(), MapError> {
-        match self.map.folder() {
-            Some(_) => self.timings.time("map save", || self.map.save()),
-            None => Ok(()),
+        if self.map.folder().is_none() {
+            return Ok(());
         }
+        let saved = caught(|| {
+            let start = Instant::now();
+            self.enter(Part::Save);
+            let saved = self.map.save();
+            self.timings.add("map save", start.elapsed().as_secs_f64() * 1e3);
+            saved
+        });
+        saved.unwrap_or_else(|what| {
+            self.map.recover();
+            Err(MapError::Panicked(what))
+        })
     }
 
     /// What is left at the end: the map, all trajectories, the stage times, and windows dropped as not finite.
@@ -459,6 +592,7 @@ impl StepMaker {
             timings: self.timings,
             steps: self.steps,
             non_finite_windows: self.non_finite,
+            panics: self.panics,
             map_saves_failed: 0,
             batch: 1,
         }
@@ -487,6 +621,8 @@ pub struct Finished {
     pub steps: u64,
     /// Windows whose result was not finite and was thrown away.
     pub non_finite_windows: u64,
+    /// Windows lost because a stage panicked.
+    pub panics: u64,
     /// Times the map could not be saved.
     pub map_saves_failed: u64,
     /// Most windows that went through the network in one forward pass.

@@ -113,7 +113,11 @@ impl Report<'_> {
         values.extend(now.stages_ms.iter().map(|(stage, x)| (format!("{stage} (ms)"), format!("{x:.1}"))));
         let skipped = now.superseded.saturating_sub(before.superseded);
         let failed = now.failed_steps.saturating_sub(before.failed_steps);
-        let (level, message) = if failed > 0 {
+        let all_panics = |s: &Status| s.panicked_steps + s.panics;
+        let panics = all_panics(now).saturating_sub(all_panics(before));
+        let (level, message) = if panics > 0 {
+            (ERROR, format!("{panics} panics; the stages were started anew"))
+        } else if failed > 0 {
             (ERROR, format!("{failed} steps failed"))
         } else if now.paused {
             (OK, "paused".into())
@@ -152,6 +156,9 @@ impl Report<'_> {
             ("predicted steps between checks", now.skips.notches[1].level),
             ("approximate steps between checks", now.skips.notches[2].level),
             ("windows not finite", now.non_finite_windows),
+            ("windows lost to a panic", now.panicked_steps),
+            ("panics of other stages", now.panics),
+            ("saves of the map failed", now.failed_saves),
             ("steps failed", now.failed_steps),
             ("outputs failed", now.failed_outputs),
             ("poses refused", now.poses_rejected),

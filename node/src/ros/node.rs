@@ -262,6 +262,7 @@ impl Running {
                     messages: messages.clone(),
                     store,
                     clock: Box::new(move || now_ns(&clock)),
+                    on_part: None,
                 };
                 let live = Live::start(options, engine, Box::new(outputs))?;
                 info!("running: {} cameras, {} by {} pixels each", rig.cameras.len(), size.0, size.1);

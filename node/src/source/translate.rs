@@ -6,6 +6,7 @@ use anyhow::Result;
 
 use crate::cdr::decode as cdr;
 use crate::decode::{self, RgbPicture};
+use crate::pipeline::guard::caught;
 use crate::sync::DropReason;
 
 use super::event::{Event, Frame, Truth};
@@ -42,48 +43,49 @@ pub enum Role {
     None,
 }
 
-/// Turns one message of `topic` into events. `logged_ns` names the message in errors when its own stamp cannot be read.
+/// Turns one message of `topic` into events. `logged_ns` names the message in errors when its own stamp cannot be read. A
+/// decoder that panics loses this one message: it keeps nothing from one to the next.
 pub fn translate(rig: &Rig, role: &Role, topic: &str, data: &[u8], logged_ns: i64, each: &mut dyn FnMut(Event)) {
-    let lost = |camera: Option<usize>, why: String| {
-        // The header stamp when it can be read, else the log time.
-        let stamp_ns = cdr::header(data).map_or(logged_ns, |h| h.stamp_ns);
-        Event::Lost { camera, reason: DropReason::Decode, detail: format!("{topic} at {stamp_ns} ns: {why}") }
+    let (reason, why) = match caught(|| events(rig, role, data)) {
+        Ok(Ok(events)) => return events.into_iter().for_each(each),
+        Ok(Err(e)) => (DropReason::Decode, format!("{e:#}")),
+        Err(what) => (DropReason::Panic, format!("its decoder panicked ({what}); this is a fault of the program")),
     };
-    match role {
-        Role::Image { camera, compressed } => match picture(rig, *camera, *compressed, data) {
-            Ok((stamp_ns, rgb)) => {
-                each(Event::Image { camera: *camera, stamp_ns, frame: Frame { rgb: Arc::new(rgb) } });
-            }
-            Err(e) => each(lost(Some(*camera), format!("{e:#}"))),
-        },
-        Role::Pose { type_name } => match cdr::pose(type_name, data) {
-            Ok(p) => each(Event::Pose { stamp_ns: p.header.stamp_ns, map_from_base: p.pose }),
-            Err(e) => each(lost(None, e.to_string())),
-        },
-        Role::Transform | Role::StaticTransform => match cdr::tf_message(data) {
-            Ok(list) => list.into_iter().for_each(|t| {
-                let t = Box::new(t);
-                each(if *role == Role::Transform { Event::Transform(t) } else { Event::StaticTransform(t) });
-            }),
-            Err(e) => each(lost(None, e.to_string())),
-        },
-        Role::Truth { camera, kind } => match truth(*camera, *kind, data) {
-            Ok(event) => each(event),
-            Err(e) => each(lost(None, format!("{e:#}"))),
-        },
-        Role::None => {}
-    }
+    // The header stamp when it can be read, else the log time.
+    let stamp_ns = cdr::header(data).map_or(logged_ns, |h| h.stamp_ns);
+    let camera = if let Role::Image { camera, .. } = role { Some(*camera) } else { None };
+    each(Event::Lost { camera, reason, detail: format!("{topic} at {stamp_ns} ns: {why}") });
+}
+
+fn events(rig: &Rig, role: &Role, data: &[u8]) -> Result<Vec<Event>> {
+    Ok(match role {
+        Role::Image { camera, compressed } => {
+            let (stamp_ns, rgb) = picture(rig, *camera, *compressed, data)?;
+            vec![Event::Image { camera: *camera, stamp_ns, frame: Frame { rgb: Arc::new(rgb) } }]
+        }
+        Role::Pose { type_name } => {
+            let p = cdr::pose(type_name, data)?;
+            vec![Event::Pose { stamp_ns: p.header.stamp_ns, map_from_base: p.pose }]
+        }
+        Role::Transform => cdr::tf_message(data)?.into_iter().map(|t| Event::Transform(Box::new(t))).collect(),
+        Role::StaticTransform => {
+            cdr::tf_message(data)?.into_iter().map(|t| Event::StaticTransform(Box::new(t))).collect()
+        }
+        Role::Truth { camera, kind } => vec![truth(*camera, *kind, data)?],
+        Role::None => Vec::new(),
+    })
 }
 
 fn picture(rig: &Rig, camera: usize, compressed: bool, data: &[u8]) -> Result<(i64, RgbPicture)> {
+    let rectifier = &rig.cameras[camera].rectifier;
     let (stamp_ns, full) = if compressed {
         let image = cdr::compressed_image(data)?;
-        (image.header.stamp_ns, decode::compressed_to_rgb(&image)?)
+        (image.header.stamp_ns, decode::compressed_of_size(&image, Some(rectifier.source_size()))?)
     } else {
         let image = cdr::image(data)?;
         (image.header.stamp_ns, decode::image_to_rgb(&image)?)
     };
-    Ok((stamp_ns, rig.cameras[camera].rectifier.apply(&full)?))
+    Ok((stamp_ns, rectifier.apply(&full)?))
 }
 
 fn truth(camera: usize, kind: TruthKind, data: &[u8]) -> Result<Event> {

@@ -28,11 +28,13 @@ pub enum DropReason {
     Decode,
     /// A bounded queue was full; the oldest goes first.
     Overflow,
+    /// The stage that had it panicked and was started anew.
+    Panic,
 }
 
 impl DropReason {
     /// Every reason, in order.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Late,
         Self::Duplicate,
         Self::Incomplete,
@@ -42,6 +44,7 @@ impl DropReason {
         Self::ClockJump,
         Self::Decode,
         Self::Overflow,
+        Self::Panic,
     ];
 
     /// The name used in logs and `metrics.json`.
@@ -56,6 +59,7 @@ impl DropReason {
             Self::ClockJump => "clock_jump",
             Self::Decode => "decode",
             Self::Overflow => "overflow",
+            Self::Panic => "panic",
         }
     }
 }

@@ -192,6 +192,12 @@ impl Tracker {
         }
     }
 
+    /// Ends all trajectories; the next step starts new ones.
+    pub fn end_all(&mut self) {
+        self.end_where(|_| true);
+        self.epoch = None;
+    }
+
     fn end_where(&mut self, ended: impl Fn(&Track) -> bool) {
         let min_points = self.config.min_points;
         for track in self.live.extract_if(.., |t| ended(t)) {

@@ -11,6 +11,7 @@ mod blend;
 mod buffers;
 mod device;
 mod error;
+mod fallback;
 mod frame;
 mod params;
 mod pipelines;
@@ -22,6 +23,7 @@ mod timings;
 
 pub use adapter::GpuOptions;
 pub use error::{GpuError, SOFTWARE_ADAPTER};
+pub use fallback::{GpuOrCpu, OnLost};
 pub use timings::GpuTimings;
 
 use crate::camera::View;
@@ -249,6 +251,60 @@ mod tests {
     use super::*;
     use crate::camera::Intrinsics;
     use glam::Affine3A;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    /// The device is lost while Gaussians are loaded: their name stays good, the pictures are the CPU's, and it is said once.
+    #[test]
+    fn a_lost_device_falls_back_to_the_cpu_with_one_warning() {
+        let gpu = match GpuRasterizer::new(RasterSettings::default(), &GpuOptions::default()) {
+            Ok(gpu) => gpu,
+            Err(error) => {
+                let required = std::env::var("REQUIRE_GPU_ADAPTER").is_ok_and(|value| value == "1");
+                assert!(!required, "REQUIRE_GPU_ADAPTER=1, but: {error}");
+                println!("SKIPPED: no wgpu adapter ({error})");
+                return;
+            }
+        };
+        let splats = Splats {
+            means: &[[0.0, 0.0, 5.0], [0.3, 0.1, 4.0]],
+            quats: &[[1.0, 0.0, 0.0, 0.0]; 2],
+            scales: &[[0.2; 3]; 2],
+            opacities: &[0.5, 0.8],
+            features: &[0.25, 0.75],
+            feature_count: 1,
+        };
+        let (still, ahead) = ([[0.0; 3]; 2], [[0.5, 0.0, 0.0], [0.0; 3]]);
+        let motion = Motion { velocity_backward: &still, velocity_forward: &ahead, time_sec: &[0.0; 2] };
+        let view = View { camera_from_world: Affine3A::IDENTITY, intrinsics: Intrinsics::from_fov(60.0, 16, 16) };
+        let mut cpu = CpuRasterizer::new(RasterSettings::default()).unwrap();
+        let on_cpu = cpu.load(&splats, Some(&motion)).unwrap();
+        let wanted = cpu.draw(on_cpu, 0.5, &Channels(0..1), &[view]).unwrap();
+        let told = Arc::new(AtomicUsize::new(0));
+        let count = told.clone();
+        let on_lost = Box::new(move |e: &GpuError| {
+            assert!(matches!(e, GpuError::DeviceLost { .. }), "{e}");
+            count.fetch_add(1, Ordering::Relaxed);
+        });
+        let mut both = GpuOrCpu::new(gpu, on_lost).unwrap();
+        let name = both.load(&splats, Some(&motion)).unwrap();
+        let before = both.draw(name, 0.5, &Channels(0..1), &[view]).unwrap();
+        let near = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(x, y)| (x - y).abs() < 1e-4);
+        assert!(near(&before[0].features, &wanted[0].features) && told.load(Ordering::Relaxed) == 0);
+        both.gpu.as_ref().unwrap().gpu.device.destroy();
+        for _ in 0..3 {
+            let after = both.draw(name, 0.5, &Channels(0..1), &[view]).unwrap();
+            assert_eq!(after, wanted);
+        }
+        assert!(both.gpu().is_none() && both.describe().starts_with("CPU"));
+        // A name of something else is still refused, and new things can be loaded.
+        assert!(both.draw(Loaded::new(), 0.5, &Channels(0..1), &[view]).is_err());
+        let again = both.load(&splats, None).unwrap();
+        assert!(both.draw(again, 0.0, &Channels(0..1), &[view]).is_ok());
+        assert!(both.draw(name, 0.5, &Channels(0..1), &[view]).is_err(), "its name ended with the next load");
+        assert!(both.render(&splats, &[view]).is_ok());
+        assert_eq!(told.load(Ordering::Relaxed), 1);
+    }
 
     #[test]
     fn a_lost_device_is_an_error_to_act_on() {

@@ -16,7 +16,7 @@ mod skew;
 mod status;
 mod stepper;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod watchdog;
 mod worker;
 

@@ -14,6 +14,8 @@ const REMEMBERED: usize = 600;
 pub struct Status {
     /// Images that came in, readable or not, given up or not.
     pub images_in: u64,
+    /// Images in synchronized sets with poses.
+    pub images_used: u64,
     /// Images given up, by reason.
     pub drops: DropCounts,
     /// Poses and transforms given up because too many waited.
@@ -36,6 +38,12 @@ pub struct Status {
     pub non_finite_windows: u64,
     /// Steps that were not computed, or approximated, and how checks of them went.
     pub skips: SkipCounts,
+    /// Windows lost because a part of the step panicked.
+    pub panicked_steps: u64,
+    /// Times another stage panicked and was started anew.
+    pub panics: u64,
+    /// Saves of the map that failed.
+    pub failed_saves: u64,
     /// Steps that failed.
     pub failed_steps: u64,
     /// Outputs that could not be sent.

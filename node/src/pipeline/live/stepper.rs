@@ -16,6 +16,7 @@ use super::status::Status;
 use super::worker::{Command, LOGGED, Message, Outlet, PATIENCE, lock};
 use crate::config::Config;
 use crate::pipeline::front::{Front, FrontOutput};
+use crate::pipeline::guard::{StagePanics, caught};
 use crate::pipeline::posed::PoseStore;
 use crate::pipeline::saver::Saver;
 use crate::pipeline::step::StepMaker;
@@ -33,6 +34,7 @@ pub(super) struct Own {
     steps: u64,
     failed_steps: u64,
     failed_outputs: u64,
+    outlet_panics: u64,
     paused_images: u64,
     paused: bool,
     hop_sec: f64,
@@ -77,16 +79,15 @@ impl Stepper {
             for event in events {
                 self.take(event, &mut ready);
             }
-            let latency_ms = if self.own.paused { None } else { self.step_newest() };
-            if let Err(e) = self.outlet.idle(&self.maker) {
-                self.output_failed(&format!("{e:#}"));
-            }
+            let latency_ms = if self.own.paused { None } else { self.step_newest()? };
+            self.output("idle", |s| s.outlet.idle(&s.maker));
             self.saver.offer(&mut self.maker);
             if !idle {
                 self.report(latency_ms);
             }
         }
         self.front.finish(&mut ready);
+        self.count_sets(&mut ready);
         self.maker.save_map().context("the map could not be saved")?;
         self.report(None);
         Ok(())
@@ -105,49 +106,72 @@ impl Stepper {
             event => event,
         };
         self.front.take(event, ready);
+        self.count_sets(ready);
+    }
+
+    fn count_sets(&mut self, ready: &mut VecDeque<FrontOutput>) {
         for output in ready.drain(..) {
             if let FrontOutput::Set(set) = output {
                 self.own.sets += 1;
                 if let Some(first) = set.frames.first() {
-                    self.outlet.vehicle(first.stamp_ns, self.front.base_pose(0, &first.map_from_camera));
+                    let map_from_base = self.front.base_pose(0, &first.map_from_camera);
+                    self.output("vehicle pose", |s| {
+                        s.outlet.vehicle(first.stamp_ns, map_from_base);
+                        Ok(())
+                    });
                 }
             }
         }
     }
 
     /// Runs the newest window, if there is one; gives how old its newest image was when everything was sent.
-    fn step_newest(&mut self) -> Option<f64> {
-        let window = self.front.newest_window()?;
+    ///
+    /// # Errors
+    /// A stage that panics every time.
+    fn step_newest(&mut self) -> Result<Option<f64>> {
+        let Some(window) = self.front.newest_window() else { return Ok(None) };
         let demand = self.outlet.demand();
         let (epoch, stamp_ns) = (window.epoch, window.stamp_ns);
         let newest_ns = window.steps.last().and_then(|s| s.frames.iter().map(|f| f.stamp_ns).max()).unwrap_or(stamp_ns);
         if let Some((_, last_ns)) = self.own.last.filter(|(e, _)| *e == epoch) {
-            let hop_sec = (stamp_ns - last_ns) as f64 * 1e-9;
+            let hop_sec = stamp_ns.saturating_sub(last_ns) as f64 * 1e-9;
             let share = if self.own.hop_sec > 0.0 { SMOOTHING } else { 1.0 };
             self.own.hop_sec += share * (hop_sec - self.own.hop_sec);
         }
         self.own.last = Some((epoch, stamp_ns));
         let step = match self.maker.run_for(window, demand) {
-            Ok(step) => step?,
+            Ok(Some(step)) => step,
+            Ok(None) => return Ok(None),
+            Err(e) if e.is::<StagePanics>() => return Err(e),
             Err(e) => {
                 self.own.failed_steps += 1;
                 if self.own.failed_steps <= LOGGED {
                     warn!("step at {stamp_ns} ns failed: {e:#}");
                 }
-                return None;
+                return Ok(None);
             }
         };
         self.own.steps += 1;
         self.own.gaussians = step.scene.gaussians.len() as u64;
         let start = Instant::now();
-        if let Err(e) = self.outlet.step(&step, &self.maker, self.front.active()) {
-            self.output_failed(&format!("step at {stamp_ns} ns: {e:#}"));
-        }
+        self.output("step", |s| s.outlet.step(&step, &s.maker, s.front.active()));
         self.publish.add("publish", start.elapsed().as_secs_f64() * 1e3);
         // What has ended is of no use to anybody here; it would only fill memory.
         drop(self.maker.ended_tracks());
         drop(self.maker.ended_objects());
-        Some(((self.clock)() - newest_ns) as f64 * 1e-6)
+        Ok(Some((self.clock)().saturating_sub(newest_ns) as f64 * 1e-6))
+    }
+
+    /// Has something sent. What fails or panics there is counted and said, and the run goes on: the next step is sent anew.
+    fn output(&mut self, what: &str, send: impl FnOnce(&mut Self) -> Result<()>) {
+        match caught(|| send(self)) {
+            Ok(Ok(())) => {}
+            Ok(Err(e)) => self.output_failed(&format!("{what}: {e:#}")),
+            Err(said) => {
+                self.own.outlet_panics += 1;
+                self.output_failed(&format!("{what}: panicked: {said}"));
+            }
+        }
     }
 
     fn output_failed(&mut self, why: &str) {
@@ -230,6 +254,7 @@ impl Stepper {
         }
         *status = Status {
             images_in: self.front.images_in() + ring + own.paused_images,
+            images_used: self.front.images_used(),
             drops,
             messages_dropped,
             messages_lost: self.front.messages_lost(),
@@ -241,6 +266,9 @@ impl Stepper {
             windows: self.front.window_counts(),
             non_finite_windows: self.maker.non_finite(),
             skips: self.maker.skips(),
+            panicked_steps: self.maker.panics(),
+            panics: self.front.panics() + own.outlet_panics,
+            failed_saves: self.saver.failed(),
             failed_steps: own.failed_steps,
             failed_outputs: own.failed_outputs,
             hop_sec: own.hop_sec,

@@ -10,7 +10,7 @@ use crate::engine::{Engine, ModelSource, UNTRAINED};
 use crate::msg::{CameraInfo, Header, Image, PoseStamped};
 use crate::pipeline::demand::Demand;
 use crate::pipeline::posed::PoseStore;
-use crate::pipeline::step::{Step, StepMaker};
+use crate::pipeline::step::{OnPart, Part, Step, StepMaker};
 use crate::poses::PoseBuffer;
 use crate::rigid::Rigid;
 use crate::source::Rig;
@@ -100,7 +100,9 @@ struct Running {
     seen: Arc<Mutex<Seen>>,
 }
 
-fn start(cameras: usize, config: &Config, delay: Duration, demand: Demand) -> anyhow::Result<Running> {
+/// Cameras that look ahead, of the pictures' size.
+pub(crate) fn rig(cameras: usize) -> Arc<Rig> {
+    let config = config(cameras);
     let intrinsics = storm_render::Intrinsics {
         fx: 40.0,
         fy: 40.0,
@@ -117,7 +119,22 @@ fn start(cameras: usize, config: &Config, delay: Duration, demand: Demand) -> an
             info: Some(CameraInfo::pinhole(&intrinsics, header(0))),
         })
         .collect();
-    let rig = Arc::new(Rig::build(described, &TfTree::new(&config.sync), "", &config.input, (WIDTH, HEIGHT))?);
+    let tree = TfTree::new(&config.sync);
+    Arc::new(Rig::build(described, &tree, "", &config.input, (WIDTH, HEIGHT)).unwrap())
+}
+
+fn start(cameras: usize, config: &Config, delay: Duration, demand: Demand) -> anyhow::Result<Running> {
+    start_with(cameras, config, delay, demand, None)
+}
+
+fn start_with(
+    cameras: usize,
+    config: &Config,
+    delay: Duration,
+    demand: Demand,
+    on_part: Option<OnPart>,
+) -> anyhow::Result<Running> {
+    let rig = rig(cameras);
     let model = ModelSource::open(&config.model)?;
     let engine = Engine::new(model, &config.model, cameras, config.window.timespan_sec)?;
     let image =
@@ -134,6 +151,7 @@ fn start(cameras: usize, config: &Config, delay: Duration, demand: Demand) -> an
         inputs,
         store: PoseStore::Buffer(PoseBuffer::new(&config.sync)),
         clock: Box::new(|| START_NS),
+        on_part,
     };
     Ok(Running { live: Live::start(options, engine, outlet)?, seen })
 }
@@ -295,4 +313,104 @@ fn a_saved_map_is_never_emptied_by_a_start() {
     let run = start(1, &c, Duration::ZERO, Demand::ALL).unwrap();
     assert!(run.until(|s| s.map_gaussians == kept), "{:?} against {kept}", run.live.status().map_gaussians);
     run.live.stop().unwrap();
+}
+
+/// Panics at the numbered entries into a part.
+fn panics_at(part: Part, times: &'static [u32]) -> OnPart {
+    let mut seen = 0;
+    Box::new(move |now| {
+        seen += u32::from(now == part);
+        assert!(now != part || !times.contains(&seen), "injected into {part:?}");
+    })
+}
+
+#[test]
+fn a_part_that_panics_loses_one_window_and_the_node_goes_on() {
+    for part in [Part::Gate, Part::Network, Part::Overlap, Part::Draw, Part::Map, Part::Follow] {
+        let mut c = config(1);
+        // Random weights say that everything moves.
+        (c.map.min_opacity, c.map.static_speed_mps) = (0.0, 1e6);
+        let run = start_with(1, &c, Duration::ZERO, Demand::ALL, Some(panics_at(part, &[3, 4]))).unwrap();
+        for i in 0..9 {
+            run.push(1, pose(i));
+            run.push(0, picture(i));
+            assert!(run.until(|s| s.steps + s.panicked_steps == i as u64), "{part:?}: {:?}", run.live.status());
+        }
+        assert!(!run.live.broken());
+        let status = run.live.stop().unwrap();
+        // A computed step passes the gate twice.
+        let lost = status.panicked_steps;
+        assert!(lost == 2 || (part == Part::Gate && lost == 1), "{part:?}: {status:?}");
+        assert_eq!((status.steps, status.sets, status.failed_steps), (8 - lost, 9, 0), "{part:?}");
+        assert!(status.map_gaussians > 0, "the map outlives a panic: {status:?}");
+    }
+}
+
+#[test]
+fn a_part_that_panics_every_time_ends_the_run_with_its_name() {
+    let on_part: OnPart = Box::new(|part| assert_ne!(part, Part::Overlap));
+    let run = start_with(1, &config(1), Duration::ZERO, Demand::ALL, Some(on_part)).unwrap();
+    let mut i = 0;
+    while !run.live.broken() && i < 200 {
+        run.push(1, pose(i));
+        run.push(0, picture(i));
+        std::thread::sleep(Duration::from_millis(10));
+        i += 1;
+    }
+    let e = format!("{:#}", run.live.stop().unwrap_err());
+    assert!(e.contains("overlap stage panicked 5 times in a row"), "{e}");
+}
+
+/// Panics in its own way at every other step.
+struct Clumsy(u32);
+
+impl Outlet for Clumsy {
+    fn demand(&mut self) -> Demand {
+        Demand::ALL
+    }
+    fn vehicle(&mut self, _: i64, _: Rigid) {
+        panic!("no vehicle");
+    }
+    fn step(&mut self, _: &Step, _: &StepMaker, _: &[usize]) -> anyhow::Result<()> {
+        self.0 += 1;
+        assert!(self.0 % 2 == 0, "every other");
+        Ok(())
+    }
+    fn idle(&mut self, _: &StepMaker) -> anyhow::Result<()> {
+        Ok(())
+    }
+    fn configure(&mut self, _: &Config) {}
+    fn times(&mut self, _: &[(&'static str, f64)]) {}
+}
+
+#[test]
+fn outputs_and_decoders_that_panic_are_counted_and_the_rest_goes_on() {
+    let c = config(1);
+    let engine = || Engine::new(ModelSource::open(&c.model).unwrap(), &c.model, 1, c.window.timespan_sec).unwrap();
+    let image = |camera| LiveInput { topic: format!("/c{camera}"), role: Role::Image { camera, compressed: false } };
+    let pose_input =
+        LiveInput { topic: "/p".into(), role: Role::Pose { type_name: "geometry_msgs/msg/PoseStamped".into() } };
+    // No such camera: where its picture is rectified an index is out of range.
+    let inputs = vec![image(0), pose_input, image(7)];
+    let options = LiveOptions {
+        rig: rig(1),
+        messages: inbox(&inputs, &c),
+        inputs,
+        store: PoseStore::Buffer(PoseBuffer::new(&c.sync)),
+        clock: Box::new(|| START_NS),
+        on_part: None,
+        config: c.clone(),
+    };
+    let live = Live::start(options, engine(), Box::new(Clumsy(0))).unwrap();
+    let run = Running { live, seen: Arc::default() };
+    for i in 0..5 {
+        run.push(1, pose(i));
+        run.push(0, picture(i));
+        run.push(2, picture(i));
+        assert!(run.until(|s| s.steps == i as u64 && s.images_in == 2 * (i as u64 + 1)), "{:?}", run.live.status());
+    }
+    let status = run.live.stop().unwrap();
+    assert_eq!((status.steps, status.sets, status.drops.get(DropReason::Panic)), (4, 5, 5), "{status:?}");
+    // Five vehicles and two of four steps.
+    assert_eq!((status.panics, status.failed_outputs), (7, 7));
 }

@@ -19,7 +19,7 @@ use crate::pipeline::demand::Demand;
 use crate::pipeline::front::Front;
 use crate::pipeline::posed::PoseStore;
 use crate::pipeline::saver::Saver;
-use crate::pipeline::step::{Step, StepMaker};
+use crate::pipeline::step::{OnPart, Step, StepMaker};
 use crate::pipeline::timing::Timings;
 use crate::rigid::Rigid;
 use crate::source::Rig;
@@ -55,6 +55,8 @@ pub struct LiveOptions {
     pub store: PoseStore,
     /// The time that stamps are of, nanoseconds: latencies are measured with it.
     pub clock: Box<dyn Fn() -> i64 + Send>,
+    /// See [`StepMaker::set_on_part`].
+    pub on_part: Option<OnPart>,
 }
 
 /// Answers a command, from the step thread.
@@ -135,13 +137,16 @@ impl Live {
     /// # Errors
     /// A map that cannot be read or made, threads that cannot be started.
     pub fn start(options: LiveOptions, engine: Engine, outlet: Box<dyn Outlet>) -> Result<Self> {
-        let LiveOptions { config, rig, inputs, messages, store, clock } = options;
+        let LiveOptions { config, rig, inputs, messages, store, clock, on_part } = options;
         // Events by camera, and one stream for everything else.
         let mut capacities = vec![config.live.queue; rig.cameras.len()];
         capacities.push(MESSAGES_AHEAD);
         let events = Arc::new(Inbox::new(&capacities));
         let mut maker = StepMaker::new(engine, rig.intrinsics(), &config, None)?;
         maker.set_map(open_map(&config)?);
+        if let Some(on_part) = on_part {
+            maker.set_on_part(on_part);
+        }
         let status = Arc::new(Mutex::new(Status::default()));
         let (commands, to_do) = unbounded();
         let is_image: Vec<bool> = inputs.iter().map(|i| matches!(i.role, Role::Image { .. })).collect();

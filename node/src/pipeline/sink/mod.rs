@@ -1,4 +1,6 @@
 //! What a replay leaves behind: takes sets, steps and ground truth in order, writes the results folder.
+//!
+//! A file that cannot be written (a full disk) is given up at that moment, with what it has, and said; the others go on.
 
 mod gallery;
 mod topics;
@@ -10,11 +12,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
+use tracing::warn;
 
 use crate::config::Config;
 use crate::engine::Engine;
 use crate::engine::score::Scorer;
 use crate::objects::MovingObject;
+use crate::output::OutputError;
 use crate::output::objects_csv::ObjectsWriter;
 use crate::output::ply::{PlyCloud, write_ply};
 use crate::output::tracks_csv::{TrackRow, TracksWriter};
@@ -31,6 +35,7 @@ use super::messages::Published;
 use super::metrics::{Counts, Metrics};
 use super::step::{Finished, Step};
 use super::timing::{Timings, peak_rss_mb};
+use crate::output::atomic::write_bytes;
 use gallery::{Gallery, Run};
 
 /// Most trajectory rows kept for the report's picture: some 2,000 trajectories of two seconds.
@@ -80,8 +85,12 @@ pub struct Sink {
     last_gaussians: u64,
     epochs: u32,
     timings: Timings,
-    tracks: TracksWriter,
-    objects: ObjectsWriter,
+    /// None once it was given up.
+    tracks: Option<TracksWriter>,
+    /// None once it was given up.
+    objects: Option<ObjectsWriter>,
+    /// What could not be written.
+    problems: Vec<String>,
     /// The first ones, for the report.
     drawn: Vec<TrackRow>,
 }
@@ -110,8 +119,9 @@ impl Sink {
             last_gaussians: 0,
             epochs: 0,
             timings: Timings::default(),
-            tracks: TracksWriter::create(&out.join("tracks.csv"))?,
-            objects: ObjectsWriter::create(&out.join("objects.csv"))?,
+            tracks: Some(TracksWriter::create(&out.join("tracks.csv"))?),
+            objects: Some(ObjectsWriter::create(&out.join("objects.csv"))?),
+            problems: Vec::new(),
             drawn: Vec::new(),
         })
     }
@@ -137,13 +147,16 @@ impl Sink {
                     self.timings.time("publish map", || publisher.map_update(&update, &self.config))?;
                 }
             }
-            SinkInput::Objects(ended) => self.write_objects(&ended)?,
-            SinkInput::Tracks(ended) => self.write_tracks(&ended)?,
+            SinkInput::Objects(ended) => self.write_objects(&ended),
+            SinkInput::Tracks(ended) => self.write_tracks(&ended),
             SinkInput::Step(step) => {
                 self.last_gaussians = step.scene.gaussians.len() as u64;
                 if let Some(publisher) = &mut self.publisher {
                     let (rig, config) = (&self.rig, &self.config);
-                    self.timings.time("publish", || publisher.step(&step, rig, config))?;
+                    if let Err(e) = self.timings.time("publish", || publisher.step(&step, rig, config)) {
+                        self.publisher = None;
+                        self.gave_up(&format!("outputs.mcap after step {}", step.index), &e);
+                    }
                 }
                 self.gallery.offer(&step);
                 if let Some(scorer) = &mut self.scorer {
@@ -154,24 +167,39 @@ impl Sink {
         Ok(())
     }
 
-    fn write_objects(&mut self, ended: &[MovingObject]) -> Result<()> {
-        for object in ended {
-            self.objects.write(object)?;
+    fn gave_up(&mut self, what: &str, e: &anyhow::Error) {
+        let line = format!("{what} could not be written: {e:#}");
+        warn!("{line}");
+        self.problems.push(line);
+    }
+
+    fn write_objects(&mut self, ended: &[MovingObject]) {
+        let Some(objects) = &mut self.objects else { return };
+        if let Some(e) = ended.iter().find_map(|object| objects.write(object).err()) {
+            self.objects = None;
+            self.gave_up("objects.csv (what there is: objects.csv.part)", &e.into());
         }
-        Ok(())
     }
 
     /// Rows of trajectories that have ended, handed to the system at once.
-    fn write_tracks(&mut self, ended: &[Track]) -> Result<()> {
+    fn write_tracks(&mut self, ended: &[Track]) {
         for track in ended {
             let rows: Vec<TrackRow> = track_rows(track).collect();
-            self.tracks.write(&rows)?;
+            if let Some(e) = self.tracks.as_mut().and_then(|tracks| tracks.write(&rows).err()) {
+                self.gave_up_tracks(e);
+            }
             if self.drawn.len() + rows.len() <= ROWS_DRAWN {
                 self.drawn.extend(rows);
             }
         }
-        self.tracks.flush()?;
-        Ok(())
+        if let Some(e) = self.tracks.as_mut().and_then(|tracks| tracks.flush().err()) {
+            self.gave_up_tracks(e);
+        }
+    }
+
+    fn gave_up_tracks(&mut self, e: OutputError) {
+        self.tracks = None;
+        self.gave_up("tracks.csv (what there is: tracks.csv.part)", &e.into());
     }
 
     /// Writes what is written once, at the end.
@@ -183,11 +211,19 @@ impl Sink {
         model: String,
         wall: Duration,
     ) -> Result<Metrics> {
-        self.write_tracks(&finished.tracks)?;
-        self.write_objects(&finished.objects)?;
-        let Self { out, config, publisher, scorer, gallery, poses, tracks, objects, drawn: rows, .. } = self;
-        tracks.finish()?;
-        objects.finish()?;
+        self.write_tracks(&finished.tracks);
+        self.write_objects(&finished.objects);
+        let Self { out, config, publisher, scorer, gallery, poses, tracks, objects, drawn: rows, mut problems, .. } =
+            self;
+        let mut written = |what: &str, done: Result<()>| {
+            if let Err(e) = done {
+                let line = format!("{what} could not be written: {e:#}");
+                warn!("{line}");
+                problems.push(line);
+            }
+        };
+        written("tracks.csv", tracks.map_or(Ok(()), |t| Ok(t.finish()?)));
+        written("objects.csv", objects.map_or(Ok(()), |o| Ok(o.finish()?)));
         let place = |name: &str| out.join(name);
         let origin = finished.map.origin();
         let map = finished.map.cloud().context("the map cannot be read back")?;
@@ -202,13 +238,15 @@ impl Sink {
             format!("storm {}; weights: {weights}; model: {model}", env!("CARGO_PKG_VERSION")),
             "static map without the sky; positions in metres, relative to origin_m in the map frame".to_string(),
         ];
-        write_ply(&place("map.ply"), &cloud, origin.to_array(), &notes)?;
-        write_tum(&place("trajectory.tum"), poses.iter().copied())?;
-        std::fs::write(place("config.yaml"), config.to_yaml()).context("cannot write config.yaml")?;
-        let published = match publisher {
-            Some(publisher) => publisher.finish(&cloud, origin, &poses, &config)?,
-            None => Published::default(),
-        };
+        written("map.ply", write_ply(&place("map.ply"), &cloud, origin.to_array(), &notes).map_err(Into::into));
+        written("trajectory.tum", write_tum(&place("trajectory.tum"), poses.iter().copied()).map_err(Into::into));
+        let yaml = config.to_yaml();
+        written("config.yaml", write_bytes(&place("config.yaml"), yaml.as_bytes()).map_err(Into::into));
+        let mut published = Published::default();
+        if let Some(publisher) = publisher {
+            let done = publisher.finish(&cloud, origin, &poses, &config);
+            written("the end of outputs.mcap", done.map(|counts| published = counts));
+        }
         let mut timings = finished.timings;
         timings.merge(self.timings);
         let held_out = match scorer {
@@ -219,7 +257,8 @@ impl Sink {
             (Some(first), Some(last)) => last.0.saturating_sub(first.0),
             _ => 0,
         };
-        let metrics = Metrics {
+        problems.extend(counts.problems);
+        let mut metrics = Metrics {
             weights,
             model,
             images_in: counts.images_in,
@@ -231,9 +270,10 @@ impl Sink {
             messages_lost: counts.messages_lost,
             poses_rejected: counts.poses_rejected,
             non_finite_windows: counts.non_finite_windows,
+            stage_panics: counts.stage_panics,
             nonfinite: published.non_finite,
             withheld: published.withheld,
-            problems: counts.problems,
+            problems,
             latency_ms: timings.stats(),
             peak_rss_mb: peak_rss_mb(),
             wall_sec: wall.as_secs_f64(),
@@ -254,11 +294,17 @@ impl Sink {
             epochs: self.epochs,
             held_out,
         };
-        let json = serde_json::to_string_pretty(&metrics).context("metrics.json")?;
-        std::fs::write(place("metrics.json"), json + "\n").context("cannot write metrics.json")?;
+        let json = serde_json::to_string_pretty(&metrics).context("metrics.json")? + "\n";
+        let mut late = Vec::new();
+        if let Err(e) = write_bytes(&place("metrics.json"), json.as_bytes()) {
+            late.push(format!("metrics.json could not be written: {e}"));
+        }
         let title = self.title;
         let run = Run { title: &title, metrics: &metrics, map: &map, tracks: &rows, poses: &poses, config: &config };
-        gallery.write(&place("report.html"), &self.rig, &run)?;
+        if let Err(e) = gallery.write(&place("report.html"), &self.rig, &run) {
+            late.push(format!("report.html could not be written: {e:#}"));
+        }
+        metrics.problems.extend(late);
         Ok(metrics)
     }
 }

@@ -1,0 +1,476 @@
+//! One function per reader: any bytes in, no panic, no endless loop, no memory out of proportion, and what is accepted is
+//! sound. They call what the program calls.
+
+use std::cell::RefCell;
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+
+use candle_core::Device;
+use glam::{DQuat, DVec3};
+use storm_model::weights;
+use storm_node::bag::Bag;
+use storm_node::cdr::decode as cdr_decode;
+use storm_node::config::Config;
+use storm_node::decode::{
+    Rectifier, RgbPicture, compressed_to_rgb, image_to_depth, image_to_labels, image_to_rgb, image_to_vectors,
+};
+use storm_node::map::{MapCloud, StaticMap};
+use storm_node::msg::{CameraInfo, CompressedImage, Header, Image, TransformStamped};
+use storm_node::output::objects_csv::read_objects;
+use storm_node::output::ply::read_ply;
+use storm_node::pipeline::front::{Front, FrontOutput};
+use storm_node::pipeline::posed::PoseStore;
+use storm_node::poses::PoseBuffer;
+use storm_node::rigid::Rigid;
+use storm_node::source::bag::BagSource;
+use storm_node::source::rig::CameraDescription;
+use storm_node::source::translate::{Role, translate};
+use storm_node::source::{Event, Frame, Rig};
+use storm_node::sync::DropReason;
+use storm_node::tf::TfTree;
+use storm_render::Intrinsics;
+
+/// Picture size of the network in these targets.
+pub const NETWORK: (usize, usize) = (16, 8);
+/// Picture size of the cameras.
+pub const CAMERA: (usize, usize) = (32, 16);
+/// Encodings the image target draws from.
+pub const ENCODINGS: [&str; 16] = [
+    "rgb8",
+    "bgr8",
+    "rgba8",
+    "bgra8",
+    "rgb16",
+    "bgr16",
+    "mono8",
+    "mono16",
+    "8UC4",
+    "uyvy",
+    "yuyv",
+    "bayer_rggb8",
+    "bayer_gbrg16",
+    "32FC1",
+    "16UC1",
+    "32FC3",
+];
+/// Pictures larger than this are not rectified: that takes time in proportion, which is no finding.
+const MOST_PIXELS: usize = 1 << 20;
+
+thread_local! {
+    static FOLDER: RefCell<Option<tempfile::TempDir>> = const { RefCell::new(None) };
+}
+
+/// Runs `with` in a folder of this thread's own, which it finds as it left it.
+fn in_folder<T>(with: impl FnOnce(&Path) -> T) -> T {
+    FOLDER.with(|folder| {
+        let mut folder = folder.borrow_mut();
+        let dir = folder.get_or_insert_with(|| tempfile::tempdir().expect("a temporary folder"));
+        with(dir.path())
+    })
+}
+
+fn write(path: &Path, bytes: &[u8]) {
+    std::fs::write(path, bytes).expect("the temporary folder takes a file");
+}
+
+/// Takes plain values off the front; zeros when nothing is left.
+struct Bytes<'a>(&'a [u8]);
+
+impl<'a> Bytes<'a> {
+    fn take(&mut self, n: usize) -> &'a [u8] {
+        let (head, rest) = self.0.split_at(n.min(self.0.len()));
+        self.0 = rest;
+        head
+    }
+
+    fn array<const N: usize>(&mut self) -> [u8; N] {
+        let mut out = [0; N];
+        let taken = self.take(N);
+        out[..taken.len()].copy_from_slice(taken);
+        out
+    }
+
+    fn u8(&mut self) -> u8 {
+        self.array::<1>()[0]
+    }
+
+    fn u16(&mut self) -> u16 {
+        u16::from_le_bytes(self.array())
+    }
+
+    fn i64(&mut self) -> i64 {
+        i64::from_le_bytes(self.array())
+    }
+
+    fn f64(&mut self) -> f64 {
+        f64::from_le_bytes(self.array())
+    }
+}
+
+/// A bag file of any storage: what `storm info` and `storm replay` read. Bytes that begin as `metadata.yaml` does are
+/// read as that file of a folder with an empty bag.
+pub fn bag(data: &[u8]) {
+    in_folder(|dir| {
+        let folder = dir.join("folder");
+        let (path, file) = if data.starts_with(b"rosbag2_bagfile_information") {
+            std::fs::create_dir_all(&folder).expect("a folder");
+            write(&folder.join("in.mcap"), &empty_mcap());
+            (folder.clone(), folder.join("metadata.yaml"))
+        } else {
+            (dir.join("bag"), dir.join("bag"))
+        };
+        write(&file, data);
+        if let Ok(bag) = Bag::open(&path) {
+            let readable: Vec<usize> = (0..bag.topics().len()).filter(|&i| bag.topics()[i].is_readable()).collect();
+            let mut last_ns = i64::MIN;
+            for message in bag.messages(&readable).expect("readable topics can be read").flatten() {
+                assert!(message.log_time_ns >= last_ns, "messages come in the order of their times");
+                assert!(readable.contains(&message.topic));
+                last_ns = message.log_time_ns;
+            }
+            let problems = bag.problems();
+            assert!(problems.len() <= 201, "{} problem lines", problems.len());
+        }
+        if let Ok(source) = BagSource::open(&path, &Config::default(), NETWORK) {
+            let _ = source.events(|_| true);
+        }
+        let _ = std::fs::remove_dir_all(&folder);
+    });
+}
+
+fn empty_mcap() -> Vec<u8> {
+    let mut writer = mcap::Writer::new(std::io::Cursor::new(Vec::new())).expect("a writer into memory");
+    writer.finish().expect("memory takes it");
+    writer.into_inner().into_inner()
+}
+
+fn header() -> Header {
+    Header { stamp_ns: 0, frame_id: "camera".into() }
+}
+
+/// Two cameras that look ahead.
+fn rig() -> Arc<Rig> {
+    static RIG: OnceLock<Arc<Rig>> = OnceLock::new();
+    RIG.get_or_init(|| {
+        let (width, height) = CAMERA;
+        let (cx, cy) = (width as f32 / 2.0, height as f32 / 2.0);
+        let intrinsics = Intrinsics { fx: 20.0, fy: 20.0, cx, cy, width, height };
+        let described = (0..2).map(|i| CameraDescription {
+            topic: format!("/camera{i}/image_rect"),
+            info_topic: format!("/camera{i}/camera_info"),
+            frame_id: Some("camera".into()),
+            info: Some(CameraInfo::pinhole(&intrinsics, header())),
+        });
+        let mut config = Config::default();
+        config.input.base_from_camera = vec![[0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5]; 2];
+        let tree = TfTree::new(&config.sync);
+        Arc::new(Rig::build(described.collect(), &tree, "", &config.input, NETWORK).expect("a sound rig"))
+    })
+    .clone()
+}
+
+/// The pose types [`storm_node::cdr::decode::pose`] reads.
+pub const POSES: [&str; 4] = [
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TransformStamped",
+];
+
+/// One message through every decoder, and through the translation to events that a bag's and a topic's messages take.
+pub fn cdr(data: &[u8]) {
+    let _ = cdr_decode::header(data);
+    let _ = cdr_decode::point_cloud2(data);
+    if let Ok(image) = cdr_decode::image(data) {
+        assert!(image.data.len() <= data.len());
+    }
+    if let Ok(info) = cdr_decode::camera_info(data) {
+        rectify(&info);
+    }
+    let rig = rig();
+    let roles = [
+        Role::Image { camera: 0, compressed: false },
+        Role::Image { camera: 1, compressed: true },
+        Role::Transform,
+        Role::StaticTransform,
+    ];
+    let poses = POSES.iter().map(|t| Role::Pose { type_name: (*t).into() });
+    let config = Config::default();
+    let mut tree = TfTree::new(&config.sync);
+    for role in roles.into_iter().chain(poses) {
+        let mut front = Front::new(&config, &rig, PoseStore::nothing(&config.sync));
+        let mut out = VecDeque::new();
+        translate(&rig, &role, "/topic", data, 0, &mut |event| {
+            if let Event::Transform(t) | Event::StaticTransform(t) = &event {
+                let _ = tree.insert(t, matches!(event, Event::StaticTransform(_)));
+                let _ = tree.lookup(&t.header.frame_id, &t.child_frame_id, t.header.stamp_ns);
+            }
+            front.take(event, &mut out);
+        });
+        front.finish(&mut out);
+    }
+}
+
+fn rectify(info: &CameraInfo) {
+    for already in [false, true] {
+        let Ok(rectifier) = Rectifier::new(info, already, NETWORK.0, NETWORK.1) else { continue };
+        let (width, height) = rectifier.source_size();
+        let Some(pixels) = width.checked_mul(height).filter(|n| *n <= MOST_PIXELS) else { continue };
+        let picture = RgbPicture { width, height, data: vec![9; pixels * 3] };
+        let out = rectifier.apply(&picture).expect("a picture of the right size");
+        assert_eq!(out.data.len(), NETWORK.0 * NETWORK.1 * 3);
+        let k = rectifier.intrinsics();
+        assert!([k.fx, k.fy, k.cx, k.cy].iter().all(|x| x.is_finite()), "{k:?}");
+    }
+}
+
+/// A picture: the first byte says whether a file (JPEG, PNG) or raw rows follow.
+pub fn image(data: &[u8]) {
+    let mut b = Bytes(data);
+    let kind = b.u8();
+    if kind & 1 == 1 {
+        let message = CompressedImage { header: header(), format: "jpeg".into(), data: b.0.to_vec() };
+        if let Ok(p) = compressed_to_rgb(&message) {
+            assert_eq!(p.data.len(), p.width * p.height * 3);
+        }
+        return;
+    }
+    let encoding = ENCODINGS[usize::from(kind >> 1) % ENCODINGS.len()];
+    let side = |b: &mut Bytes| match u32::from(b.u16()) {
+        // Far sides, which must be refused.
+        n if n >= 0xff00 => n << 16,
+        n => n,
+    };
+    let (width, height, step) = (side(&mut b), side(&mut b), side(&mut b));
+    let is_bigendian = b.u8() & 1 == 1;
+    let encoding = encoding.to_owned();
+    let image = Image { header: header(), height, width, encoding, is_bigendian, step, data: b.0.to_vec() };
+    let pixels = width as usize * height as usize;
+    if let Ok(p) = image_to_rgb(&image) {
+        assert_eq!(p.data.len(), pixels * 3);
+    }
+    if let Ok(p) = image_to_depth(&image) {
+        assert_eq!(p.data.len(), pixels);
+    }
+    if let Ok(p) = image_to_vectors(&image) {
+        assert_eq!(p.len(), pixels);
+    }
+    if let Ok(p) = image_to_labels(&image) {
+        assert_eq!(p.len(), pixels);
+    }
+}
+
+/// Numbers in every storage of a wrapped pickle.
+const STORAGE_BYTES: usize = 1024;
+
+/// A weights file: safetensors or a PyTorch checkpoint. A bare pickle is put into a checkpoint first, since no mutation
+/// gets a zip's checksums right.
+pub fn weights(data: &[u8]) {
+    in_folder(|dir| {
+        let path = dir.join("weights.pth");
+        let pickle = data.first() == Some(&0x80);
+        match pickle {
+            true => write(&path, &checkpoint(data)),
+            false => write(&path, data),
+        }
+        if let Ok((config, tensors)) = weights::load(&path, None, &Device::Cpu) {
+            config.validate().expect("what is loaded is a network");
+            assert!(!tensors.is_empty());
+        }
+    });
+}
+
+/// A zip as `torch.save` writes it: stored entries, the pickle first.
+pub fn checkpoint(pickle: &[u8]) -> Vec<u8> {
+    let zeros = [0u8; STORAGE_BYTES];
+    let entries: Vec<(String, &[u8])> = std::iter::once(("a/data.pkl".to_owned(), pickle))
+        .chain((0..4).map(|i| (format!("a/data/{i}"), &zeros[..])))
+        .collect();
+    let (mut out, mut directory) = (Vec::new(), Vec::new());
+    for (name, bytes) in &entries {
+        let at = out.len() as u32;
+        let size = (bytes.len() as u32).to_le_bytes();
+        let common = [&[0; 6], &[0; 4][..], &crc32fast::hash(bytes).to_le_bytes(), &size, &size].concat();
+        let name_len = (name.len() as u16).to_le_bytes();
+        out.extend([b"PK\x03\x04\x14\0".as_slice(), &common[2..], &name_len, &[0; 2], name.as_bytes(), bytes].concat());
+        let head = [b"PK\x01\x02\x14\0\x14\0".as_slice(), &common[2..], &name_len, &[0; 12]].concat();
+        directory.extend([head.as_slice(), &at.to_le_bytes(), name.as_bytes()].concat());
+    }
+    let count = (entries.len() as u16).to_le_bytes();
+    let (at, len) = ((out.len() as u32).to_le_bytes(), (directory.len() as u32).to_le_bytes());
+    out.extend(directory);
+    out.extend([b"PK\x05\x06".as_slice(), &[0; 4], &count, &count, &len, &at, &[0; 2]].concat());
+    out
+}
+
+/// A saved map. `STRMMAPX`: the index alone, as it stands. `ply`: a `map.ply`. `object_id`: an `objects.csv`. Everything
+/// else is the payload of an index (its length in two bytes) and of a tile, which get sound heads and checksums first: no
+/// mutation finds those.
+pub fn map(data: &[u8]) {
+    in_folder(|dir| {
+        let dir = dir.join("map");
+        let _ = std::fs::remove_dir_all(&dir);
+        std::fs::create_dir_all(&dir).expect("a folder");
+        if data.starts_with(b"ply") || data.starts_with(b"object_id") {
+            let path = dir.join("file");
+            write(&path, data);
+            if let Ok(ply) = read_ply(&path) {
+                let c = &ply.cloud;
+                assert!(c.positions.iter().flatten().chain(c.scales.iter().flatten()).all(|x| x.is_finite()));
+            }
+            let _ = read_objects(&path);
+            return;
+        }
+        if data.starts_with(b"STRMMAPX") {
+            write(&dir.join("map.index"), data);
+        } else {
+            let mut b = Bytes(data);
+            let len = usize::from(b.u16());
+            let (mut index, tile) = (b.take(len).to_vec(), b.0);
+            let sealed = seal(b"STRMTILE", tile);
+            if let Some(line) = index.get_mut(INDEX_HEAD..INDEX_HEAD + INDEX_LINE) {
+                line[24..28].copy_from_slice(&crc32fast::hash(tile).to_le_bytes());
+                let word = |at: usize| i32::from_le_bytes([line[at], line[at + 1], line[at + 2], line[at + 3]]);
+                let revision = u64::from_le_bytes(std::array::from_fn(|i| line[12 + i]));
+                let name = format!("{}_{}_{}.{revision}.tile", word(0), word(4), word(8));
+                write(&dir.join(name), &sealed);
+            }
+            write(&dir.join("map.index"), &seal(b"STRMMAPX", &index));
+        }
+        for salvage in [false, true] {
+            let Ok((map, _)) = StaticMap::open(&dir, salvage) else { continue };
+            if let Ok(cloud) = map.cloud_of(1000) {
+                sound(&cloud);
+            }
+            let _ = map.changed_since(0);
+            let _ = map.evidence(DVec3::ONE);
+        }
+    });
+}
+
+fn sound(cloud: &MapCloud) {
+    let finite = |x: &f32| x.is_finite();
+    assert!(cloud.positions.iter().flatten().all(finite), "positions");
+    assert!(cloud.scales.iter().flatten().all(finite), "scales");
+    assert!(cloud.quats.iter().flatten().all(finite), "quaternions");
+    assert!(cloud.opacities.iter().all(finite), "opacities");
+    assert!(cloud.colors01.iter().flatten().all(finite), "colours");
+}
+
+/// Bytes of an index's payload before its lines, and of a line.
+pub const INDEX_HEAD: usize = 56;
+const INDEX_LINE: usize = 28;
+/// Bytes of a map file's head: magic, version, length, checksum.
+pub const MAP_HEAD: usize = 24;
+
+fn seal(magic: &[u8; 8], payload: &[u8]) -> Vec<u8> {
+    let (len, crc) = ((payload.len() as u64).to_le_bytes(), crc32fast::hash(payload).to_le_bytes());
+    [magic.as_slice(), &1u32.to_le_bytes(), &len, &crc, payload].concat()
+}
+
+/// A configuration file; text that begins with `--set ` is an assignment of the command line.
+pub fn config(data: &[u8]) {
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    let config = match text.strip_prefix("--set ") {
+        Some(assignment) => Config::default().with_override(assignment),
+        None => Config::from_yaml(text),
+    };
+    if let Ok(config) = config {
+        config.validate().expect("what is read was checked");
+        let again = Config::from_yaml(&config.to_yaml()).expect("what is written can be read");
+        assert_eq!(again, config);
+    }
+}
+
+/// A row of events with any stamps and poses through synchronisation, poses and windows. What came in is what came out or
+/// was dropped; nothing that is not finite comes out.
+pub fn front(data: &[u8]) {
+    let mut b = Bytes(data);
+    let rig = rig();
+    let config = Config::default();
+    let options = b.u8();
+    let store = match options & 1 {
+        0 => PoseStore::Buffer(PoseBuffer::new(&config.sync)),
+        _ => PoseStore::Tree { tree: TfTree::new(&config.sync), fixed: "map".into(), base: "base".into() },
+    };
+    let on_demand = options & 2 == 2;
+    let mut front = match on_demand {
+        true => Front::on_demand(&config, &rig, store),
+        false => Front::new(&config, &rig, store),
+    };
+    let frame = Frame { rgb: Arc::new(RgbPicture { width: 1, height: 1, data: vec![0; 3] }) };
+    let mut out = VecDeque::new();
+    let (mut now_ns, mut images, mut used) = (0i64, 0u64, 0u64);
+    while !b.0.is_empty() {
+        let what = b.u8();
+        // Mostly small steps of time, sometimes any stamp at all.
+        let stamp_ns = match what >> 6 {
+            0 => b.i64(),
+            _ => now_ns.wrapping_add(i64::from(b.u16() as i16) * 1_000_000),
+        };
+        now_ns = if what & 0x20 == 0 { stamp_ns } else { now_ns };
+        let event = match what & 7 {
+            0..=2 => {
+                images += 1;
+                Event::Image { camera: usize::from(what & 1), stamp_ns, frame: frame.clone() }
+            }
+            3 => Event::Pose { stamp_ns, map_from_base: pose(&mut b) },
+            4 | 5 => {
+                let transform = pose(&mut b);
+                let parent = Header { stamp_ns, frame_id: ["map", "base", "odom"][usize::from(what >> 3) % 3].into() };
+                let child = ["base", "odom", "map"][usize::from(b.u8()) % 3];
+                let t = Box::new(TransformStamped { header: parent, child_frame_id: child.into(), transform });
+                if what & 1 == 0 { Event::Transform(t) } else { Event::StaticTransform(t) }
+            }
+            6 => {
+                images += 1;
+                Event::Lost { camera: Some(0), reason: DropReason::Decode, detail: String::new() }
+            }
+            _ => {
+                let _ = front.newest_window();
+                continue;
+            }
+        };
+        front.take(event, &mut out);
+        used += taken(&mut out);
+        if on_demand && what & 0x18 == 0x18 {
+            let _ = front.newest_window();
+        }
+    }
+    front.finish(&mut out);
+    used += taken(&mut out);
+    let (came, dropped) = (front.images_in(), front.drops().total());
+    assert_eq!(came, images, "images in");
+    assert_eq!(came, 2 * used + dropped, "{} dropped of {came}, {used} sets", front.drops());
+}
+
+/// Sets among the outputs, which are checked.
+fn taken(out: &mut VecDeque<FrontOutput>) -> u64 {
+    let mut sets = 0;
+    for output in out.drain(..) {
+        match output {
+            FrontOutput::Set(set) => {
+                sets += 1;
+                assert!(set.frames.iter().all(|f| f.map_from_camera.is_finite()));
+            }
+            FrontOutput::Window(window) => {
+                assert!(window.map_from_anchor.is_finite());
+                assert!(window.time_sec.iter().flatten().all(|t| t.is_finite()));
+            }
+            FrontOutput::Truth { .. } => {}
+        }
+    }
+    sets
+}
+
+/// Any rigid transform, mostly a sound one.
+fn pose(b: &mut Bytes) -> Rigid {
+    match b.u8() {
+        0 => {
+            let q = DQuat::from_xyzw(b.f64(), b.f64(), b.f64(), b.f64());
+            Rigid::new(q, DVec3::new(b.f64(), b.f64(), b.f64()))
+        }
+        n => Rigid::new(DQuat::from_rotation_z(f64::from(n) * 0.05), DVec3::new(f64::from(b.u8()), 0.0, 0.0)),
+    }
+}
