@@ -30,7 +30,8 @@ pub(super) struct Report {
 #[derive(Debug, Serialize)]
 pub(super) struct DriveSetting {
     pub setting: String,
-    pub skips: Vec<String>,
+    /// Configuration keys it changes.
+    pub set: Vec<String>,
     #[serde(flatten)]
     pub drives: Drives,
 }
@@ -176,6 +177,8 @@ impl Report {
             "full, ms",
             "ladder, ms",
             "times less",
+            "a still step, ms",
+            "a predicted one, ms",
             "PSNR, dB",
             "EPE3D, m/s",
             "moving IoU",
@@ -200,6 +203,8 @@ impl Report {
                     format!("{:.1}", r.full_ms),
                     format!("{:.1}", r.ms),
                     format!("{:.2}", r.ratio),
+                    cell(r.still_ms, 2),
+                    cell(r.predicted_ms, 2),
                     both(|f| f.psnr, 2),
                     both(|f| f.epe3d, 3),
                     both(|f| f.moving_iou, 3),
@@ -207,6 +212,11 @@ impl Report {
                     count(s.drives.skips.broken),
                 ]);
             }
+        }
+        text += "\nStages of a full step of these drives, everything asked for:\n\n";
+        text += &head(&["stage", "p50, ms", "p99, ms"]);
+        for (stage, t) in self.drives.iter().take(1).flat_map(|s| &s.drives.stages_ms) {
+            text += &row(&[stage.clone(), format!("{:.2}", t.p50), format!("{:.2}", t.p99)]);
         }
         text + "\n"
     }
