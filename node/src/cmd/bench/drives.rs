@@ -289,7 +289,7 @@ fn score(
 
 /// A picture with fresh sensor noise.
 fn noisy(rgb: &RgbPicture, dice: &mut Dice) -> RgbPicture {
-    let mut noise = || NOISE * ((0..12).map(|_| dice.unit() as f32).sum::<f32>() - 6.0);
+    let mut noise = || NOISE * ((0..12).map(|_| dice.unit()).sum::<f32>() - 6.0);
     let data = rgb.data.iter().map(|&x| (f32::from(x) + noise()).round().clamp(0.0, 255.0) as u8).collect();
     RgbPicture { data, ..*rgb }
 }

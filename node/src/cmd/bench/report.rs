@@ -9,6 +9,9 @@ use super::sizes::{Point, rate};
 use crate::engine::figures::Figures;
 use crate::output::plot::{self, Axis, Drawn, Panel, Series};
 
+/// One figure of many.
+type Get = fn(&Figures) -> Option<f64>;
+
 /// What came out.
 #[derive(Debug, Default, Serialize)]
 pub(super) struct Report {
@@ -165,7 +168,7 @@ impl Report {
         let mut text = String::from(
             "## Skipping\n\n`tiny` over drives at 10 Hz, everything asked for (map, trajectories, objects, pictures): mean time per step with \
              every step computed and with the setting's ladder, on the same windows. Errors are of scenes against the truth, full \
-             and with the ladder. `mixed` is all of them one after the other, four in five steps standing.\n\n",
+             and with the ladder. `mixed` is all of them one after the other.\n\n",
         );
         text += &head(&[
             "setting",
@@ -259,7 +262,7 @@ impl Report {
         let against_truth: Vec<&Setting> =
             self.settings.iter().filter(|s| s.against == super::network::TRUTH).collect();
         let mut panels = Vec::new();
-        let figures: [(&str, fn(&Figures) -> Option<f64>); 2] =
+        let figures: [(&str, Get); 2] =
             [("PSNR of held-out pictures, dB", |f| f.psnr), ("EPE3D, m/s (lower is better)", |f| f.epe3d)];
         for (label, get) in figures.into_iter().filter(|_| !against_truth.is_empty()) {
             let mut series: Vec<Series> = against_truth
