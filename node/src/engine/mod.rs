@@ -172,6 +172,11 @@ impl Engine {
         Ok(())
     }
 
+    /// Whether steps leave anything out or round anything at present.
+    pub fn approximates(&self) -> bool {
+        !self.shortcuts.exact()
+    }
+
     /// The network's configuration.
     pub fn model_config(&self) -> &ModelConfig {
         self.model.config()
@@ -195,10 +200,19 @@ impl Engine {
 
     /// The same, leaving nothing out and rounding nothing.
     pub fn exact_step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
+        let mut scenes = self.exact_steps(&[window], cameras)?;
+        scenes.pop().context("the network gave no scene")?
+    }
+
+    /// [`Engine::steps`], leaving nothing out and rounding nothing.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn exact_steps(&mut self, windows: &[&Window<Frame>], cameras: &[Intrinsics]) -> Result<Vec<Result<Scene>>> {
         let shortcuts = std::mem::take(&mut self.shortcuts);
-        let scene = self.step(window, cameras);
+        let scenes = self.steps(windows, cameras);
         self.shortcuts = shortcuts;
-        scene
+        scenes
     }
 
     /// Runs the network on several windows in one forward pass. One result per window: a window whose result is not

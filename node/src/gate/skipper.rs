@@ -228,7 +228,10 @@ impl Skipper {
 
     /// So far.
     pub fn counts(&self) -> SkipCounts {
-        let notches = [&self.still, &self.predicted, &self.approximate].map(Contract::counts);
+        let mut notches = [&self.still, &self.predicted, &self.approximate].map(Contract::counts);
+        if !self.config.still {
+            notches[0].level = 0;
+        }
         let [still, predicted, approximate] = notches;
         SkipCounts {
             still: still.steps,

@@ -1,6 +1,7 @@
 //! What skipping saves and costs: a vehicle that stands, cruises and drives through traffic, with every step computed and with the
 //! ladder of notches, on the same windows in turn.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -18,6 +19,7 @@ use crate::engine::{Engine, ModelSource};
 use crate::gate::contract::Notch;
 use crate::gate::skipper::SkipCounts;
 use crate::pipeline::step::{Step, StepMaker};
+use crate::pipeline::timing::StageStats;
 use crate::source::Frame;
 use crate::source::world::posed_set;
 use crate::window::{PosedSet, Window, WindowBuilder};
@@ -75,6 +77,9 @@ pub(super) struct DriveRow {
     pub ms: f64,
     /// How many times less.
     pub ratio: f64,
+    /// Median milliseconds of a step that was taken again, and of one that was predicted.
+    pub still_ms: Option<f64>,
+    pub predicted_ms: Option<f64>,
     /// Error figures, likewise.
     pub full: Option<Figures>,
     pub skipping: Option<Figures>,
@@ -85,6 +90,8 @@ pub(super) struct DriveRow {
 pub(super) struct Drives {
     pub rows: Vec<DriveRow>,
     pub skips: SkipCounts,
+    /// Per stage of full steps, over all drives.
+    pub stages_ms: BTreeMap<String, StageStats>,
 }
 
 /// Times and errors over one kind of drive.
@@ -93,7 +100,7 @@ struct Sums {
     steps: usize,
     /// Steps run in full beside them.
     full_steps: usize,
-    notches: [usize; 3],
+    notches: [Vec<f64>; 3],
     ms: [f64; 2],
     tallies: [Tally; 2],
 }
@@ -119,7 +126,7 @@ pub(super) fn run(config: &Config, seconds_scale: f64, tick: &mut dyn FnMut(f64)
     let rows = [Doing::Standing, Doing::Cruising, Doing::Busy].into_iter().zip(&sums);
     let mut rows: Vec<DriveRow> = rows.map(|(doing, sum)| sum.row(doing.name())).collect();
     rows.push(mixed(&rows));
-    Ok(Drives { rows, skips: makers[1].skips() })
+    Ok(Drives { rows, skips: makers[1].skips(), stages_ms: makers[0].timings().stats() })
 }
 
 fn maker(config: &Config) -> Result<StepMaker> {
@@ -144,6 +151,8 @@ fn mixed(rows: &[DriveRow]) -> DriveRow {
         full_ms,
         ms,
         ratio: full_ms / ms,
+        still_ms: None,
+        predicted_ms: None,
         full: None,
         skipping: None,
     }
@@ -152,7 +161,12 @@ fn mixed(rows: &[DriveRow]) -> DriveRow {
 impl Sums {
     fn row(&self, drive: &'static str) -> DriveRow {
         let (full_ms, ms) = (self.ms[0] / self.full_steps.max(1) as f64, self.ms[1] / self.steps.max(1) as f64);
-        let [still, predicted, approximate] = self.notches;
+        let [still, predicted, approximate] = [0, 1, 2].map(|n| self.notches[n].len());
+        let median = |n: usize| {
+            let mut ms = self.notches[n].clone();
+            ms.sort_by(f64::total_cmp);
+            ms.get(ms.len() / 2).copied()
+        };
         let figures = |t: &Tally| (t.images() > 0).then(|| t.figures());
         let [full, skipping] = [figures(&self.tallies[0]), figures(&self.tallies[1])];
         DriveRow {
@@ -164,6 +178,8 @@ impl Sums {
             full_ms,
             ms,
             ratio: full_ms / ms,
+            still_ms: median(0),
+            predicted_ms: median(1),
             full,
             skipping,
         }
@@ -237,9 +253,10 @@ impl Part {
             for (m, maker) in makers.iter_mut().enumerate().filter(|(m, _)| *m == 1 || full_too) {
                 let start = Instant::now();
                 let step = maker.run(window.clone())?.context("a step of the drive is not finite")?;
-                sum.ms[m] += start.elapsed().as_secs_f64() * 1e3;
+                let ms = start.elapsed().as_secs_f64() * 1e3;
+                sum.ms[m] += ms;
                 if let Some(notch) = step.notch.filter(|_| m == 1) {
-                    sum.notches[Notch::ALL.iter().position(|n| *n == notch).unwrap_or(0)] += 1;
+                    sum.notches[Notch::ALL.iter().position(|n| *n == notch).unwrap_or(0)].push(ms);
                 }
                 if sum.steps.is_multiple_of(SCORE_EVERY) && self.doing != Doing::Standing {
                     score(&mut sum.tallies[m], &window, &seen, self.cameras(), &step)?;
@@ -272,7 +289,7 @@ fn score(
 
 /// A picture with fresh sensor noise.
 fn noisy(rgb: &RgbPicture, dice: &mut Dice) -> RgbPicture {
-    let mut noise = || NOISE * ((0..12).map(|_| dice.unit() as f32).sum::<f32>() - 6.0);
+    let mut noise = || NOISE * ((0..12).map(|_| dice.unit()).sum::<f32>() - 6.0);
     let data = rgb.data.iter().map(|&x| (f32::from(x) + noise()).round().clamp(0.0, 255.0) as u8).collect();
     RgbPicture { data, ..*rgb }
 }

@@ -181,7 +181,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
                 );
             }
         });
-        report.drives.push(DriveSetting { setting: row.name.clone(), skips: row.set.clone(), drives });
+        report.drives.push(DriveSetting { setting: row.name.clone(), set: row.set.clone(), drives });
     }
     for (curve, size) in sizes {
         bar.set_message(format!("cost against {curve}"));

@@ -9,6 +9,9 @@ use super::sizes::{Point, rate};
 use crate::engine::figures::Figures;
 use crate::output::plot::{self, Axis, Drawn, Panel, Series};
 
+/// One figure of many.
+type Get = fn(&Figures) -> Option<f64>;
+
 /// What came out.
 #[derive(Debug, Default, Serialize)]
 pub(super) struct Report {
@@ -30,7 +33,8 @@ pub(super) struct Report {
 #[derive(Debug, Serialize)]
 pub(super) struct DriveSetting {
     pub setting: String,
-    pub skips: Vec<String>,
+    /// Configuration keys it changes.
+    pub set: Vec<String>,
     #[serde(flatten)]
     pub drives: Drives,
 }
@@ -164,7 +168,7 @@ impl Report {
         let mut text = String::from(
             "## Skipping\n\n`tiny` over drives at 10 Hz, everything asked for (map, trajectories, objects, pictures): mean time per step with \
              every step computed and with the setting's ladder, on the same windows. Errors are of scenes against the truth, full \
-             and with the ladder. `mixed` is all of them one after the other, four in five steps standing.\n\n",
+             and with the ladder. `mixed` is all of them one after the other.\n\n",
         );
         text += &head(&[
             "setting",
@@ -176,6 +180,8 @@ impl Report {
             "full, ms",
             "ladder, ms",
             "times less",
+            "a still step, ms",
+            "a predicted one, ms",
             "PSNR, dB",
             "EPE3D, m/s",
             "moving IoU",
@@ -200,6 +206,8 @@ impl Report {
                     format!("{:.1}", r.full_ms),
                     format!("{:.1}", r.ms),
                     format!("{:.2}", r.ratio),
+                    cell(r.still_ms, 2),
+                    cell(r.predicted_ms, 2),
                     both(|f| f.psnr, 2),
                     both(|f| f.epe3d, 3),
                     both(|f| f.moving_iou, 3),
@@ -207,6 +215,11 @@ impl Report {
                     count(s.drives.skips.broken),
                 ]);
             }
+        }
+        text += "\nStages of a full step of these drives, everything asked for:\n\n";
+        text += &head(&["stage", "p50, ms", "p99, ms"]);
+        for (stage, t) in self.drives.iter().take(1).flat_map(|s| &s.drives.stages_ms) {
+            text += &row(&[stage.clone(), format!("{:.2}", t.p50), format!("{:.2}", t.p99)]);
         }
         text + "\n"
     }
@@ -249,7 +262,7 @@ impl Report {
         let against_truth: Vec<&Setting> =
             self.settings.iter().filter(|s| s.against == super::network::TRUTH).collect();
         let mut panels = Vec::new();
-        let figures: [(&str, fn(&Figures) -> Option<f64>); 2] =
+        let figures: [(&str, Get); 2] =
             [("PSNR of held-out pictures, dB", |f| f.psnr), ("EPE3D, m/s (lower is better)", |f| f.epe3d)];
         for (label, get) in figures.into_iter().filter(|_| !against_truth.is_empty()) {
             let mut series: Vec<Series> = against_truth

@@ -19,9 +19,10 @@ pub(super) struct Named {
 type Row = (&'static str, &'static [&'static str], bool);
 
 /// Settings of the network. The first is the configuration's default.
-const NETWORK: [Row; 15] = [
+const NETWORK: [Row; 16] = [
     ("default", &[], true),
     ("bf16", &["model.precision=bf16"], true),
+    ("int16", &["model.precision=int16"], true),
     ("int8", &["model.precision=int8"], true),
     ("keys pooled 2x2", &["skip.kv_pool=2"], false),
     ("keys pooled 4x4", &["skip.kv_pool=4"], false),

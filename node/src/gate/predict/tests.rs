@@ -70,7 +70,7 @@ fn draw(scene: &Scene, k: i64) -> Vec<RenderedView> {
 /// A picture of the true scene with noise, changed by `paint`.
 fn picture(scene: &Scene, k: i64, paint: &dyn Fn(&mut RgbPicture)) -> RgbPicture {
     let mut dice = Dice::new(31 * k as u64 + 1);
-    let mut noise = || (0..12).map(|_| dice.unit() as f32).sum::<f32>() - 6.0;
+    let mut noise = || (0..12).map(|_| dice.unit()).sum::<f32>() - 6.0;
     let data = draw(scene, k)[0].rgb8().iter().map(|&x| (f32::from(x) + noise()).round() as u8).collect();
     let mut rgb = RgbPicture { width: CAMERA.width, height: CAMERA.height, data };
     paint(&mut rgb);
