@@ -84,7 +84,8 @@ impl SkyPatches {
             for (camera, frame) in set.frames.iter().enumerate() {
                 let (width, height) = (frame.item.rgb.width, frame.item.rgb.height);
                 let (cols, rows) = (width / self.patch, height / self.patch);
-                let patches = judged.and_then(|j| Some((j, j.cameras.get(camera)?))).filter(|(_, p)| p.len() == rows * cols);
+                let patches =
+                    judged.and_then(|j| Some((j, j.cameras.get(camera)?))).filter(|(_, p)| p.len() == rows * cols);
                 for at in 0..rows * cols {
                     let gone = patches.is_some_and(|(judged, patches)| {
                         patches[at].sky
