@@ -9,13 +9,13 @@ use std::time::Instant;
 
 use candle_core::{Device, Result, Tensor};
 use storm_model::kernels::Isa;
-use storm_model::ops::{self, Activation, Linear};
+use storm_model::ops::{self, Activation, Linear, Precision};
 use storm_model::plain;
 
 use common::{cpu_seconds, fma_peak};
 
 /// Timed runs of each case, after one that is not.
-const RUNS: usize = 3;
+const RUNS: usize = 7;
 /// Runs of the peak loop, of which the best counts.
 const PEAK_RUNS: usize = 10;
 
@@ -64,6 +64,8 @@ fn main() -> Result<()> {
             let qkv = Tensor::randn(0f32, 1.0, (1, n, 3 * heads * d), &cpu)?;
             let flop = 4.0 * (n * n * heads * d) as f64;
             report(&format!("attention n={n} heads={heads} d={d}"), flop, time(|| ops::attention(&qkv, heads))?, peak);
+            let whole = || ops::attention_at(&qkv, heads, Precision::Int16);
+            report("  in whole numbers", flop, time(whole)?, peak);
             if n < 2000 {
                 report("  plain candle", flop, time(|| plain::attention(&qkv, heads))?, peak);
             }
@@ -86,6 +88,8 @@ fn main() -> Result<()> {
             let flop = 2.0 * (m * k * n) as f64;
             let name = |what: &str| format!("{what} {m} x {k} x {n}");
             report(&name("linear"), flop, time(|| ops::linear(&x, &layer, Activation::None, None))?, peak);
+            let whole = layer.at(Precision::Int16);
+            report("  in whole numbers", flop, time(|| ops::linear(&x, &whole, Activation::None, None))?, peak);
             report(
                 "  + GELU + residual",
                 flop,

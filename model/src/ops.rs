@@ -45,8 +45,11 @@ pub struct Linear {
     pub bias: Option<Tensor>,
     precision: Precision,
     /// By precision.
-    packed: Arc<[OnceLock<(TensorId, Arc<PackedWeight>)>; Precision::ALL.len()]>,
+    packed: Arc<[Packing; Precision::ALL.len()]>,
 }
+
+/// A kernel's layout, once made, and the weight it was made of.
+type Packing = OnceLock<(TensorId, Arc<PackedWeight>)>;
 
 impl Linear {
     /// A layer of a weight `(out, in)` and a bias `(out)`.

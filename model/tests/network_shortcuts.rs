@@ -1,4 +1,5 @@
 //! What a forward pass leaves out or rounds: exact when off, close where it should be, and never more than it says.
+#![allow(clippy::unwrap_used)]
 
 use candle_core::{Device, Tensor};
 use glam::{Affine3A, Vec3};

@@ -82,9 +82,10 @@ impl SkyPatches {
         for set in &window.steps {
             let judged = self.nearest(set);
             for (camera, frame) in set.frames.iter().enumerate() {
-                let (width, height) = (frame.item.rgb.width as usize, frame.item.rgb.height as usize);
+                let (width, height) = (frame.item.rgb.width, frame.item.rgb.height);
                 let (cols, rows) = (width / self.patch, height / self.patch);
-                let patches = judged.and_then(|j| Some((j, j.cameras.get(camera)?))).filter(|(_, p)| p.len() == rows * cols);
+                let patches =
+                    judged.and_then(|j| Some((j, j.cameras.get(camera)?))).filter(|(_, p)| p.len() == rows * cols);
                 for at in 0..rows * cols {
                     let gone = patches.is_some_and(|(judged, patches)| {
                         patches[at].sky
@@ -193,7 +194,7 @@ mod tests {
 
     fn set(stamp_ns: i64, paint: impl Fn(usize) -> u8) -> Arc<PosedSet<Frame>> {
         let data = (0..WIDTH * HEIGHT * 3).map(|i| paint(i / 3)).collect();
-        let rgb = RgbPicture { width: WIDTH as u32, height: HEIGHT as u32, data };
+        let rgb = RgbPicture { width: WIDTH, height: HEIGHT, data };
         let map_from_camera = Rigid::new(glam::DQuat::IDENTITY, glam::DVec3::ZERO);
         let frame = PosedFrame { stamp_ns, map_from_camera, item: Frame { rgb: Arc::new(rgb) } };
         Arc::new(PosedSet { stamp_ns, epoch: 0, frames: vec![frame] })

@@ -129,7 +129,7 @@ impl Sizes {
 
 /// The larger number, or NaN if there is one.
 #[inline(always)]
-fn larger(a: f32, b: f32) -> f32 {
+pub(super) fn larger(a: f32, b: f32) -> f32 {
     if a >= b || a.is_nan() { a } else { b }
 }
 

@@ -10,11 +10,11 @@ use std::cell::{Cell, RefCell};
 
 use rayon::prelude::*;
 
-use super::pack::{Inputs, Layout, Shape, Source, logit_scale};
+use super::pack::{Inputs, Layout, Shape, Source, larger, logit_scale};
 use super::{BLOCK_KEYS, BLOCK_QUERIES, Output, start_at, whole_blocks};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
-use crate::kernels::gemm::integer::{factors_of, quantise, row_factors};
+use crate::kernels::gemm::integer::{factors_of, largest_of, quantise, row_factors};
 use crate::kernels::gemm::{Pairs, tile_of};
 use crate::kernels::math::{ROUND, exp2, exp2_rough};
 use crate::kernels::simd::{Kernel, Simd, dispatch};
@@ -83,12 +83,10 @@ impl Kernel for Pack<'_> {
         rows.resize(4 * depth, 0);
         let (one, two) = rows.split_at_mut(2 * depth);
 
-        // The larger of what was and a row's largest; NaN stays.
-        let larger = |a: f32, x: &[f32]| x.iter().fold(a, |a, x| if x.abs() <= a || a.is_nan() { a } else { x.abs() });
         let (mut key_top, mut value_top) = (0f32, 0f32);
         for t in 0..count {
-            key_top = larger(key_top, inputs.keys.head(row(t), head, d));
-            value_top = larger(value_top, inputs.values.head(row(t), head, d));
+            key_top = larger(key_top, largest_of(inputs.keys.head(row(t), head, d)));
+            value_top = larger(value_top, largest_of(inputs.values.head(row(t), head, d)));
         }
         let (key_factor, key) = row_factors(key_top, largest_channel(d));
         let (value_factor, value) = row_factors(value_top, VALUE);
@@ -279,18 +277,21 @@ fn whole<S: Simd>(x: S::V, offset: S::V) -> S::V {
 /// Weights `2^(x - offset)` to the nearest whole number, as pairs across the vectors of each tile; returns their sum.
 #[inline(always)]
 fn quantised_weights<S: Simd>(logits: &[f32], offset: f32, tiles: usize, weights: &mut [f32]) -> f32 {
-    let (offset, round) = (S::splat(offset), S::splat(ROUND));
+    let offset = S::splat(offset);
+    // Both halves of a pair once: at most 128 pairs of two weights of 12 bits.
+    let ones = S::splat(f32::from_bits(0x0001_0001));
     let mut sum = S::zero();
     for (logits, to) in logits.chunks_exact(2 * S::W).zip(weights.chunks_exact_mut(S::W)).take(tiles) {
         // SAFETY: two vectors of logits, one of pairs.
         unsafe {
             let low = whole::<S>(S::load(logits.as_ptr()), offset);
             let high = whole::<S>(S::load(logits.as_ptr().add(S::W)), offset);
-            sum = S::add(sum, S::add(S::sub(low, round), S::sub(high, round)));
-            S::store(to.as_mut_ptr(), S::pair(low, high));
+            let pair = S::pair(low, high);
+            sum = S::mul_add_pairs(pair, ones, sum);
+            S::store(to.as_mut_ptr(), pair);
         }
     }
-    S::sum(sum)
+    S::sum(S::whole_to_float(sum))
 }
 
 /// [`super::attention_of`] in whole numbers. AVX-512 machines run the AVX2 kernel: wider products of pairs would be code that

@@ -47,7 +47,7 @@ impl IntegerScales {
 
 /// Largest absolute value; NaN where there is one.
 #[inline(always)]
-fn largest_of(x: &[f32]) -> f32 {
+pub(crate) fn largest_of(x: &[f32]) -> f32 {
     // As bits: absolute values are ordered like them, and NaN is past all.
     f32::from_bits(x.iter().fold(0, |top, x| top.max(x.to_bits() & 0x7fff_ffff)))
 }
