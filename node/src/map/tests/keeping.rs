@@ -224,3 +224,17 @@ fn a_map_that_broke_off_in_the_middle_is_made_whole() {
     drive(&mut map, 3..5);
     check(&map);
 }
+
+#[test]
+fn an_index_with_sizes_no_map_has_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut map = StaticMap::in_folder(&MapConfig::default(), dir.path()).unwrap();
+    drive(&mut map, 0..1);
+    map.save().unwrap();
+    for (tile_m, voxel_m) in [(16.0, 1e190), (1e300, 1e299), (16.0, 1e-9), (f64::NAN, 0.1)] {
+        let index =
+            MapIndex { tile_m, voxel_m, origin: DVec3::ZERO, revision: 1, first_stamp_ns: 0, entries: Vec::new() };
+        std::fs::write(dir.path().join("map.index"), super::super::format::encode_index(&index)).unwrap();
+        assert!(StaticMap::open(dir.path(), true).is_err(), "{tile_m} {voxel_m}");
+    }
+}
