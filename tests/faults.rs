@@ -55,7 +55,7 @@ fn broken_off(path: &Path) -> usize {
     bag.messages(&[topic]).unwrap().filter(Result::is_ok).count()
 }
 
-/// No file may grow beyond 400 kB: what the system refuses then is what it refuses on a full disk.
+/// No file may grow beyond 1 MB: what the system refuses then is what it refuses on a full disk.
 #[cfg(unix)]
 #[test]
 fn a_file_that_cannot_grow_is_given_up_and_everything_else_is_whole() {
@@ -63,7 +63,7 @@ fn a_file_that_cannot_grow_is_given_up_and_everything_else_is_whole() {
     let (bag, out) = (dir.path().join("bag.mcap"), dir.path().join("out"));
     Maker::default().write(&bag);
     let script = format!(
-        "trap '' XFSZ; ulimit -f 400; exec {} --quiet replay {} --out {} --set model.image_width=48 --set model.image_height=32 \
+        "trap '' XFSZ; ulimit -f 1000; exec {} --quiet replay {} --out {} --set model.image_width=48 --set model.image_height=32 \
          --set map.static_speed_mps=100 --set output.report_steps=0",
         env!("CARGO_BIN_EXE_storm"),
         bag.display(),
@@ -80,8 +80,7 @@ fn a_file_that_cannot_grow_is_given_up_and_everything_else_is_whole() {
     assert_eq!(code(&whole), 0, "{}", stderr(&whole));
     assert_eq!(m["steps"], metrics(&dir.path().join("whole"))["steps"], "every step was run");
     assert!(out.join("tracks.csv").exists() && out.join("trajectory.tum").exists());
-    let steps = broken_off(&out.join("outputs.mcap"));
-    println!("{steps} steps are in outputs.mcap");
+    assert!(broken_off(&out.join("outputs.mcap")) > 0, "what was written before can be read");
     assert_eq!(code(&storm(&["map", out.join("map").to_str().unwrap()])), 0);
 }
 

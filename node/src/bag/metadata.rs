@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 use super::error::BagError;
 use super::limits::MAX_METADATA_BYTES;
+use crate::config::nests_too_deep;
 
 /// File name of the metadata in a bag folder.
 pub(crate) const METADATA_FILE: &str = "metadata.yaml";
@@ -54,6 +55,12 @@ impl Metadata {
             return Err(BagError::TooLarge { path, what, claimed: size, limit: MAX_METADATA_BYTES });
         }
         let text = std::fs::read(&path).map_err(BagError::io(&path))?;
+        if nests_too_deep(&text) {
+            return Err(BagError::Damaged {
+                path,
+                why: "not rosbag2 metadata: its brackets nest without end".to_owned(),
+            });
+        }
         let document: Document = serde_yaml::from_slice(&text)
             .map_err(|e| BagError::Damaged { path: path.clone(), why: format!("not rosbag2 metadata: {e}") })?;
         Ok(Some(document.rosbag2_bagfile_information))

@@ -182,7 +182,8 @@ impl Bag {
         self.inner.files.iter().filter_map(|f| Some(f.storage.span_ns()?.1)).max()
     }
 
-    /// Messages of the topics with the indices `wanted`, in log-time order over all files, ties in file order. Streams:
+    /// Messages of the topics with the indices `wanted`, in log-time order over all files, ties in file order (where the index
+    /// of an MCAP file says when its chunks begin as it is; else there is a problem line). Streams:
     /// memory holds a bounded number of MCAP chunks and, for sqlite3, 24 bytes per message beside the message at hand.
     ///
     /// # Errors

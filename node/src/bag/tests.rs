@@ -425,6 +425,9 @@ fn metadata_that_explodes_is_refused() {
     std::fs::write(dir.path().join("metadata.yaml"), alias_bomb("rosbag2_bagfile_information")).unwrap();
     let e = Bag::open(dir.path()).unwrap_err().to_string();
     assert!(e.contains("metadata"), "{e}");
+    std::fs::write(dir.path().join("metadata.yaml"), "[".repeat(1 << 20)).unwrap();
+    let e = Bag::open(dir.path()).unwrap_err().to_string();
+    assert!(e.contains("nest"), "{e}");
 }
 
 /// Aliases of aliases under `key`.

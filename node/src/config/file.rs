@@ -38,6 +38,31 @@ pub enum ConfigError {
     },
 }
 
+/// Deepest nesting of brackets in any YAML that is read.
+const MAX_DEPTH: usize = 128;
+
+/// Whether brackets nest so deep that the YAML library is not to see the text: its time grows with the square of the depth, so
+/// that 100 kB of brackets would keep it busy for minutes. Brackets in quotes count too, which no sound text notices.
+pub(crate) fn nests_too_deep(text: &[u8]) -> bool {
+    let mut depth = 0usize;
+    text.iter().any(|byte| {
+        match byte {
+            b'[' | b'{' => depth += 1,
+            b']' | b'}' => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+        depth > MAX_DEPTH
+    })
+}
+
+fn check_depth(path: &str, text: &str) -> Result<(), ConfigError> {
+    let message = || format!("brackets nest deeper than {MAX_DEPTH}");
+    match nests_too_deep(text.as_bytes()) {
+        true => Err(ConfigError::Parse { path: path.into(), message: message() }),
+        false => Ok(()),
+    }
+}
+
 impl Config {
     /// Reads a YAML file and checks it. A ROS 2 parameter file (`/**: ros__parameters:`) is accepted too.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
@@ -51,6 +76,7 @@ impl Config {
 
     /// Parses and checks YAML text.
     pub fn from_yaml(text: &str) -> Result<Self, ConfigError> {
+        check_depth("text", text)?;
         let parse = |e: serde_yaml::Error| ConfigError::Parse { path: "text".into(), message: e.to_string() };
         let value: serde_yaml::Value = serde_yaml::from_str(text).map_err(parse)?;
         let config: Self = match ros_parameters(&value) {
@@ -82,6 +108,7 @@ impl Config {
         let (name, value) = assignment.split_once('=').ok_or_else(|| wrong("wants KEY=VALUE".into()))?;
         let (section, key) = name.trim().split_once('.').ok_or_else(|| wrong("the key wants section.key".into()))?;
         let parse = |e: serde_yaml::Error| wrong(e.to_string());
+        check_depth(&format!("--set {name}"), value)?;
         let mut tree = serde_yaml::to_value(self).map_err(parse)?;
         let value: serde_yaml::Value = serde_yaml::from_str(value).map_err(parse)?;
         match tree.get_mut(section).and_then(|s| s.get_mut(key)) {

@@ -10,6 +10,7 @@ mod section;
 mod validate;
 
 pub use file::ConfigError;
+pub(crate) use file::nests_too_deep;
 pub use parameters::RUN_TIME;
 pub use section::ParameterDoc;
 use section::section;

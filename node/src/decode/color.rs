@@ -101,14 +101,14 @@ fn bt601(y: u8, u: u8, v: u8) -> [u8; 3] {
 
 fn bayer_rgb(image: &Image, pattern: Pattern, bits: u32) -> Result<RgbPicture, DecodeError> {
     let (width, height) = (image.width as usize, image.height as usize);
+    // Before there is memory for it: what the message claims may be anything.
+    let rows = rows(image, if bits == 16 { width * 2 } else { width })?;
     let mut samples = Vec::with_capacity(width * height);
-    if bits == 16 {
-        for row in rows(image, width * 2)? {
+    for row in rows {
+        if bits == 16 {
             let (pairs, _) = row.as_chunks::<2>();
             samples.extend(pairs.iter().map(|s| sample16(*s, image.is_bigendian)));
-        }
-    } else {
-        for row in rows(image, width)? {
+        } else {
             samples.extend(row.iter().map(|s| u16::from(*s)));
         }
     }
@@ -177,7 +177,12 @@ mod tests {
         assert!(e.contains("4x4") && e.contains("step 12") && e.contains("40 bytes") && e.contains("48"), "{e}");
         assert!(image_to_rgb(&image("rgb8", 4, 4, 11, &[0; 48])).unwrap_err().to_string().contains("12 bytes"));
         assert!(image_to_rgb(&image("rgb8", 0, 4, 0, &[])).unwrap_err().to_string().contains("no pixels"));
-        assert!(image_to_rgb(&image("rgb8", u32::MAX, u32::MAX, 0, &[0; 9])).is_err());
+        // Nothing is allocated for what is only claimed: a few bytes that ask for 34 GB once ended the program.
+        for encoding in ["rgb8", "mono16", "uyvy", "bayer_rggb8", "bayer_gbrg16"] {
+            for side in [u32::MAX, 131_071, 32_768] {
+                assert!(image_to_rgb(&image(encoding, side, side, 0, &[0; 9])).is_err(), "{encoding} {side}");
+            }
+        }
         let e = image_to_rgb(&image("32FC3", 1, 1, 12, &[0; 12])).unwrap_err().to_string();
         assert!(e.contains("`32FC3`") && e.contains("bgr8") && e.contains("colour"), "{e}");
     }

@@ -106,6 +106,11 @@ impl Rectifier {
             width,
             height,
         };
+        // What is a camera in f64 may be none in the f32 that everything behind this works in.
+        let k = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy];
+        if !(k.iter().all(|x| x.is_finite()) && k[0].abs() >= f32::MIN_POSITIVE && k[1].abs() >= f32::MIN_POSITIVE) {
+            return Err(wrong(format!("its focal lengths and centre {k:?} at {width}x{height} are no camera's")));
+        }
         Ok(Self { intrinsics, source: (window.width, window.height), rectified_from_camera, path })
     }
 

@@ -201,6 +201,11 @@ fn cameras_that_are_none_are_refused_with_the_value() {
     says(&CameraInfo { roi: [u32::MAX, 0, 100, 100], ..good.clone() }, 8, 8, "region of interest");
     says(&CameraInfo { binning_x: 1000, ..good.clone() }, 8, 8, "binning 1000x1");
     says(&CameraInfo { distortion_model: "omni".to_owned(), ..good.clone() }, 8, 8, "`omni`");
+    // Sound in f64, and infinite or nothing in the f32 of the network.
+    let huge = CameraInfo { k: [20.0, 0.0, 1e300, 0.0, 20.0, 8.0, 0.0, 0.0, 1.0], ..good.clone() };
+    says(&huge, 8, 8, "no camera's");
+    let tiny = CameraInfo { k: [1e-300, 0.0, 9.0, 0.0, 20.0, 8.0, 0.0, 0.0, 1.0], ..good.clone() };
+    says(&tiny, 8, 8, "no camera's");
     says(&good, 0, 8, "output size 0x8");
     says(&good, 8, usize::MAX, "output size 8x");
     let mut bad_r = with_p(good.clone(), DQuat::IDENTITY);

@@ -12,7 +12,7 @@ use glam::{DVec3, Vec3};
 use super::cell::{Cell, MAX_WEIGHT, SUPPORT_MAX};
 use super::error::MapError;
 use super::tile::{Tile, TileIndex};
-use super::voxel::{LEVELS, MAX_CELLS, level_of};
+use super::voxel::{LEVELS, MAX_CELLS, MAX_PER_EDGE, level_of};
 
 const TILE_MAGIC: [u8; 8] = *b"STRMTILE";
 const INDEX_MAGIC: [u8; 8] = *b"STRMMAPX";
@@ -229,7 +229,12 @@ pub(super) fn decode_index(path: &Path) -> Result<MapIndex, MapError> {
     let f = |at: usize| f64::from_bits(le_u64(&p, at));
     let origin = DVec3::new(f(16), f(24), f(32));
     let (tile_m, voxel_m) = (f(0), f(8));
-    if !(tile_m > 0.0 && tile_m.is_finite() && voxel_m > 0.0 && voxel_m.is_finite() && origin.is_finite()) {
+    // Somewhat more than `map.tile_m` and `map.voxel_m` accept; in between everything is finite in f32.
+    let sound = (0.1..=1e4).contains(&tile_m)
+        && (1e-3..=1e3).contains(&voxel_m)
+        && voxel_m >= tile_m / f64::from(MAX_PER_EDGE)
+        && origin.is_finite();
+    if !sound {
         return Err(damaged("its sizes or origin are no numbers a map has"));
     }
     let entries = p[INDEX_HEAD..]

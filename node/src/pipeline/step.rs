@@ -512,3 +512,29 @@ pub fn newest_time_sec(window: &Window<Frame>) -> f32 {
     let first = window.steps.first().map_or(window.stamp_ns, |s| s.stamp_ns);
     (window.stamp_ns.saturating_sub(first) as f64 * 1e-9) as f32
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::ModelSource;
+    use crate::engine::evaluate::clip::Clip;
+
+    #[test]
+    fn a_batch_that_panics_is_run_one_by_one_and_a_window_that_does_is_lost_alone() {
+        let config = Config::default();
+        let clips: Vec<Clip> = (3..6).map(|seed| Clip::of_seed(seed, (48, 32)).unwrap()).collect();
+        for (times, lost) in [(&[1][..], 0), (&[1, 3][..], 1)] {
+            let source = ModelSource::open(&config.model).unwrap();
+            let engine = Engine::new(source, &config.model, 3, config.window.timespan_sec).unwrap();
+            let mut maker = StepMaker::new(engine, clips[0].cameras.clone(), &config, None).unwrap();
+            let mut seen = 0;
+            maker.set_on_part(Box::new(move |part| {
+                seen += u32::from(part == Part::Network);
+                assert!(part != Part::Network || !times.contains(&seen), "injected");
+            }));
+            let results = maker.run_all(clips.iter().map(|c| c.window.clone()).collect()).unwrap();
+            let missing = results.iter().filter(|r| r.step.is_none()).count();
+            assert_eq!((results.len(), missing, maker.panics()), (3, lost, lost as u64));
+        }
+    }
+}

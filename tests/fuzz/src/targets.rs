@@ -123,14 +123,16 @@ pub fn bag(data: &[u8]) {
         write(&file, data);
         if let Ok(bag) = Bag::open(&path) {
             let readable: Vec<usize> = (0..bag.topics().len()).filter(|&i| bag.topics()[i].is_readable()).collect();
-            let mut last_ns = i64::MIN;
+            let (mut last_ns, mut ordered) = (i64::MIN, true);
             for message in bag.messages(&readable).expect("readable topics can be read").flatten() {
-                assert!(message.log_time_ns >= last_ns, "messages come in the order of their times");
+                ordered &= message.log_time_ns >= last_ns;
                 assert!(readable.contains(&message.topic));
                 last_ns = message.log_time_ns;
             }
             let problems = bag.problems();
             assert!(problems.len() <= 201, "{} problem lines", problems.len());
+            let said = problems.iter().any(|line| line.contains("out of order"));
+            assert!(ordered || said || problems.len() > 200, "messages come in the order of their times");
         }
         if let Ok(source) = BagSource::open(&path, &Config::default(), NETWORK) {
             let _ = source.events(|_| true);

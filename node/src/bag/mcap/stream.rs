@@ -148,6 +148,12 @@ impl McapStream {
         if places.is_empty() {
             return Ok(());
         }
+        if let Some(first_ns) = places.iter().map(|p| p.log_time_ns).min().filter(|first_ns| *first_ns < start_ns) {
+            self.problem(&format!(
+                "chunk at byte {offset}: its first message is of {first_ns} ns, its index says {start_ns}; messages may come \
+                 out of order"
+            ));
+        }
         let messages_left = places.len();
         self.heap.extend(places.into_iter().map(Reverse));
         self.unpacked_bytes += content.records.len();

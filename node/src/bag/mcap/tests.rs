@@ -262,3 +262,22 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn an_index_that_lies_about_times_costs_the_order_and_is_said() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("x.mcap");
+    let options = WriteOptions::new().chunk_size(Some(1_500)).compression(None).calculate_summary_section_crc(false);
+    let mut bytes = sample(options);
+    // The first chunk's line of the index: opcode, length, then when the chunk begins (the sample's first time).
+    let line = (0..bytes.len() - 17)
+        .rev()
+        .filter(|&i| bytes[i] == super::records::op::CHUNK_INDEX && bytes[i + 9..i + 17] == 1_000u64.to_le_bytes())
+        .find(|&i| u64::from_le_bytes(std::array::from_fn(|k| bytes[i + 1 + k])) < 1_000)
+        .unwrap();
+    bytes[line + 9..line + 17].copy_from_slice(&3_000u64.to_le_bytes());
+    std::fs::write(&path, bytes).unwrap();
+    let (bag, messages) = read_all(&path).unwrap();
+    assert_eq!(messages.len(), MESSAGES as usize, "all the same, every message is read");
+    assert!(bag.problems().iter().any(|line| line.contains("out of order")), "{:?}", bag.problems());
+}

@@ -234,3 +234,38 @@ fn a_late_loop_closure_moves_tiles_and_brings_two_passes_together() {
     let (loaded, _) = StaticMap::load(&MapConfig::default(), dir.path(), false).unwrap();
     assert_eq!(loaded.cloud().unwrap(), c);
 }
+
+#[test]
+fn a_map_that_broke_off_in_the_middle_is_made_whole() {
+    let mut map = StaticMap::new(&MapConfig::default());
+    drive(&mut map, 0..3);
+    let whole = map.cloud().unwrap();
+    map.recover();
+    check(&map);
+    assert_eq!(map.cloud().unwrap(), whole, "nothing was broken and nothing is lost");
+    // A cell half written, one that is there twice, and an index that was being rebuilt.
+    map.tiles[0].cells[0].position.x = f32::NAN;
+    let twin = map.tiles[1].cells[0];
+    map.tiles[1].cells.push(twin);
+    map.by_index.clear();
+    map.recover();
+    check(&map);
+    assert_eq!(map.len(), whole.len() - 1);
+    assert_eq!(map.counts().tiles_lost, 0);
+    drive(&mut map, 3..5);
+    check(&map);
+}
+
+#[test]
+fn an_index_with_sizes_no_map_has_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut map = StaticMap::in_folder(&MapConfig::default(), dir.path()).unwrap();
+    drive(&mut map, 0..1);
+    map.save().unwrap();
+    for (tile_m, voxel_m) in [(16.0, 1e190), (1e300, 1e299), (16.0, 1e-9), (f64::NAN, 0.1)] {
+        let index =
+            MapIndex { tile_m, voxel_m, origin: DVec3::ZERO, revision: 1, first_stamp_ns: 0, entries: Vec::new() };
+        std::fs::write(dir.path().join("map.index"), super::super::format::encode_index(&index)).unwrap();
+        assert!(StaticMap::open(dir.path(), true).is_err(), "{tile_m} {voxel_m}");
+    }
+}

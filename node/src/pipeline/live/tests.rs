@@ -373,7 +373,7 @@ impl Outlet for Clumsy {
     }
     fn step(&mut self, _: &Step, _: &StepMaker, _: &[usize]) -> anyhow::Result<()> {
         self.0 += 1;
-        assert!(self.0 % 2 == 0, "every other");
+        assert!(self.0.is_multiple_of(2), "every other");
         Ok(())
     }
     fn idle(&mut self, _: &StepMaker) -> anyhow::Result<()> {
