@@ -163,18 +163,19 @@ impl Engine {
         &self.shortcuts
     }
 
-    /// Makes anew all that a step changes: the rasteriser and its buffers. The network only ever reads its weights.
+    /// Makes anew all that a step changes: the rasteriser and its buffers, what was seen of the sky. The network only ever reads its weights.
     ///
     /// # Errors
     /// None that [`Engine::new`] would not have met.
     pub fn restart(&mut self) -> Result<()> {
         self.raster = CpuRasterizer::new(self.model.config().raster_settings())?;
+        self.sky.forget();
         Ok(())
     }
 
     /// Whether steps leave anything out or round anything at present.
     pub fn approximates(&self) -> bool {
-        !self.shortcuts.exact()
+        !self.shortcuts.exact() || self.sky.enabled()
     }
 
     /// The network's configuration.
@@ -209,10 +210,7 @@ impl Engine {
     /// # Errors
     /// As there.
     pub fn exact_steps(&mut self, windows: &[&Window<Frame>], cameras: &[Intrinsics]) -> Result<Vec<Result<Scene>>> {
-        let shortcuts = std::mem::take(&mut self.shortcuts);
-        let scenes = self.steps(windows, cameras);
-        self.shortcuts = shortcuts;
-        scenes
+        self.run(windows, cameras, true)
     }
 
     /// Runs the network on several windows in one forward pass. One result per window: a window whose result is not
@@ -221,20 +219,22 @@ impl Engine {
     /// # Errors
     /// Windows whose shapes differ or that the network does not take.
     pub fn steps(&mut self, windows: &[&Window<Frame>], cameras: &[Intrinsics]) -> Result<Vec<Result<Scene>>> {
+        self.run(windows, cameras, false)
+    }
+
+    fn run(&mut self, windows: &[&Window<Frame>], cameras: &[Intrinsics], exact: bool) -> Result<Vec<Result<Scene>>> {
+        let shortcuts = if exact { Shortcuts::default() } else { self.shortcuts.clone() };
         let clips = windows.iter().map(|w| self.clip(w, cameras)).collect::<Result<Vec<_>>>()?;
         let output = match (clips.as_slice(), windows) {
             ([], _) => return Ok(Vec::new()),
             ([one], [window]) => {
-                let Some(keep) = self.sky.keep(window, cameras) else {
-                    let scene = self.model.forward_with(one, &self.shortcuts)?.scene(0);
-                    return Ok(vec![self.judged(window, scene, None)]);
-                };
-                let shortcuts = Shortcuts { keep: Some(keep), ..self.shortcuts.clone() };
+                let keep = if exact { None } else { self.sky.keep(window, cameras) };
+                let shortcuts = Shortcuts { keep, ..shortcuts };
                 let scene = self.model.forward_with(one, &shortcuts)?.scene(0);
                 return Ok(vec![self.judged(window, scene, shortcuts.keep.as_deref())]);
             }
             // What is left out differs from window to window: of several at once all patches are computed.
-            (several, _) => self.model.forward_with(&ClipBatch::stack(several)?, &self.shortcuts)?,
+            (several, _) => self.model.forward_with(&ClipBatch::stack(several)?, &shortcuts)?,
         };
         Ok((0..clips.len()).map(|i| Ok(output.scene(i)?)).collect())
     }

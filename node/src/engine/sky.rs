@@ -64,6 +64,17 @@ impl SkyPatches {
         }
     }
 
+    /// Whether patches may be left out at all.
+    pub fn enabled(&self) -> bool {
+        self.enabled
+    }
+
+    /// Forgets what was seen.
+    pub fn forget(&mut self) {
+        self.sets.clear();
+        self.steps = 0;
+    }
+
     /// Patches of this window to compute, as the network's shortcuts take them; none: all.
     pub fn keep(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Option<Vec<bool>> {
         if !self.enabled {
