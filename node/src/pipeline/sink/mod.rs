@@ -144,7 +144,11 @@ impl Sink {
             }
             SinkInput::Map(update) => {
                 if let Some(publisher) = &mut self.publisher {
-                    self.timings.time("publish map", || publisher.map_update(&update, &self.config))?;
+                    let config = &self.config;
+                    if let Err(e) = self.timings.time("publish map", || publisher.map_update(&update, config)) {
+                        self.publisher = None;
+                        self.gave_up("outputs.mcap at a map update", &e);
+                    }
                 }
             }
             SinkInput::Objects(ended) => self.write_objects(&ended),
