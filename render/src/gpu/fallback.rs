@@ -19,6 +19,9 @@ pub struct GpuOrCpu {
     kept: Option<Kept>,
 }
 
+/// Velocity backward and forward (m/s) and time (s) of every Gaussian.
+type OwnedMotion = (Vec<[f32; 3]>, Vec<[f32; 3]>, Vec<f32>);
+
 /// What was loaded, to load it again elsewhere.
 struct Kept {
     /// The name the caller knows.
@@ -31,7 +34,7 @@ struct Kept {
     opacities: Vec<f32>,
     features: Vec<f32>,
     feature_count: usize,
-    motion: Option<(Vec<[f32; 3]>, Vec<[f32; 3]>, Vec<f32>)>,
+    motion: Option<OwnedMotion>,
 }
 
 impl Kept {

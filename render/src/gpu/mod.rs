@@ -291,7 +291,7 @@ mod tests {
         let before = both.draw(name, 0.5, &Channels(0..1), &[view]).unwrap();
         let near = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(x, y)| (x - y).abs() < 1e-4);
         assert!(near(&before[0].features, &wanted[0].features) && told.load(Ordering::Relaxed) == 0);
-        both.gpu.as_ref().unwrap().gpu.device.destroy();
+        both.gpu().unwrap().gpu.device.destroy();
         for _ in 0..3 {
             let after = both.draw(name, 0.5, &Channels(0..1), &[view]).unwrap();
             assert_eq!(after, wanted);
