@@ -111,25 +111,17 @@ fn a_disk_that_fills_up_is_said_and_what_was_saved_stays_whole() {
     assert!(said.contains("outputs.mcap") && said.contains("No space left") && !said.contains("panicked"), "{said}");
 }
 
+/// A soak with faults of one small camera.
+const SOAK: [&str; 7] = ["--quiet", "soak", "--faults", "--size", "24x16", "--cameras", "1"];
+
 #[test]
 fn a_live_run_that_is_killed_goes_on_from_its_map() {
     let dir = tempfile::tempdir().unwrap();
     let map = dir.path().join("map");
     let soak = |seconds: &str| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_storm"));
-        command.args([
-            "--quiet",
-            "soak",
-            "--faults",
-            "--size",
-            "24x16",
-            "--cameras",
-            "1",
-            "--seconds",
-            seconds,
-            "--map",
-        ]);
-        command.arg(&map).args(["--set", "map.save_every_sec=0.05", "--set", "map.static_speed_mps=100"]);
+        command.args(SOAK).args(["--seconds", seconds, "--map"]).arg(&map).args(["--set", "map.save_every_sec=0.05"]);
+        command.args(["--set", "map.static_speed_mps=100"]);
         command
     };
     let mut child = soak("3600").stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
@@ -156,21 +148,8 @@ fn a_live_run_that_is_killed_goes_on_from_its_map() {
 fn a_soak_with_faults_writes_what_it_counted() {
     let dir = tempfile::tempdir().unwrap();
     let json = dir.path().join("soak.json");
-    let args = [
-        "--quiet",
-        "soak",
-        "--faults",
-        "--size",
-        "24x16",
-        "--cameras",
-        "1",
-        "--seconds",
-        "40",
-        "--seed",
-        "3",
-        "--json",
-    ];
-    let output = storm(&[&args[..], &[json.to_str().unwrap()]].concat());
+    let more = ["--seconds", "40", "--seed", "3", "--json", json.to_str().unwrap()];
+    let output = storm(&[&SOAK[..], &more].concat());
     assert_eq!(code(&output), 0, "{}\n{}", String::from_utf8_lossy(&output.stdout), stderr(&output));
     let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&json).unwrap()).unwrap();
     assert_eq!(report["nonfinite"], 0);

@@ -153,17 +153,13 @@ impl Engine {
         self
     }
 
-    /// What the next steps leave out or round. With `skip.sky` the engine makes a `keep` of its own for each step.
-    pub fn set_shortcuts(&mut self, shortcuts: Shortcuts) {
-        self.shortcuts = shortcuts;
-    }
-
-    /// What steps leave out or round at present.
+    /// What steps leave out or round at present; with `skip.sky` each step has a `keep` of its own besides.
     pub fn shortcuts(&self) -> &Shortcuts {
         &self.shortcuts
     }
 
-    /// Makes anew all that a step changes: the rasteriser and its buffers, what was seen of the sky. The network only ever reads its weights.
+    /// Makes anew all that a step changes: the rasteriser and its buffers, what was seen of the sky. The network only ever
+    /// reads its weights.
     ///
     /// # Errors
     /// None that [`Engine::new`] would not have met.

@@ -7,6 +7,7 @@ use super::cell::{Cell, Sample, covariance};
 use super::eigen::rotation_and_scales;
 use super::tile::TileIndex;
 use super::voxel::{key_at, level_of};
+use super::{MapError, StaticMap};
 
 /// Standard deviations below this come out as this, metres: a flat or single-point cell stays drawable.
 const MIN_SCALE_M: f64 = 1e-4;
@@ -100,5 +101,46 @@ impl MapCloud {
     /// True when there are none.
     pub fn is_empty(&self) -> bool {
         self.positions.is_empty()
+    }
+}
+
+impl StaticMap {
+    /// The whole map as plain arrays, sorted by tile and voxel. When it has more than `map.max_written` Gaussians,
+    /// every second, every third, ... is left out, evenly over each tile.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn cloud(&self) -> Result<MapCloud, MapError> {
+        self.cloud_of(self.config.max_written)
+    }
+
+    /// The same with at most about `most` Gaussians; 0: all.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn cloud_of(&self, most: usize) -> Result<MapCloud, MapError> {
+        let every = match most {
+            0 => 1,
+            most => self.len().div_ceil(most).max(1),
+        };
+        let mut cloud = MapCloud::empty(self.origin());
+        self.each_tile(|corner, tile| {
+            let live: Vec<_> = tile.live().step_by(every).copied().collect();
+            cloud.push_cells(corner, self.config.voxel_m, &live, true);
+        })?;
+        Ok(cloud)
+    }
+
+    /// One tile as plain arrays.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn tile_cloud(&self, index: &TileIndex) -> Result<MapCloud, MapError> {
+        let mut cloud = MapCloud::empty(self.origin());
+        self.with_tile(index, |corner, tile| {
+            let live: Vec<_> = tile.live().copied().collect();
+            cloud.push_cells(corner, self.config.voxel_m, &live, true);
+        })?;
+        Ok(cloud)
     }
 }

@@ -340,63 +340,6 @@ impl StaticMap {
         Some(StaticEvidence { confidence: cell.weight, seen_for_sec })
     }
 
-    /// Tiles that changed after `revision`, by index; all of them for 0. An empty cloud means that nothing is left in
-    /// the tile. Tiles on disk are included as they were saved.
-    ///
-    /// # Errors
-    /// A tile on disk that cannot be read.
-    pub fn changed_since(&self, revision: u64) -> Result<Vec<(TileIndex, MapCloud)>, MapError> {
-        self.changed_tiles(revision).into_iter().map(|index| Ok((index, self.tile_cloud(&index)?))).collect()
-    }
-
-    /// Which tiles [`StaticMap::changed_since`] would give.
-    pub fn changed_tiles(&self, revision: u64) -> Vec<TileIndex> {
-        let here = self.tiles.iter().map(|t| (t.index, t.revision));
-        let away = self.away().map(|(index, revision, _)| (index, revision));
-        let mut changed: Vec<TileIndex> = here.chain(away).filter(|(_, r)| *r > revision).map(|(i, _)| i).collect();
-        changed.sort_unstable();
-        changed
-    }
-
-    /// The whole map as plain arrays, sorted by tile and voxel. When it has more than `map.max_written` Gaussians,
-    /// every second, every third, ... is left out, evenly over each tile.
-    ///
-    /// # Errors
-    /// A tile on disk that cannot be read.
-    pub fn cloud(&self) -> Result<MapCloud, MapError> {
-        self.cloud_of(self.config.max_written)
-    }
-
-    /// The same with at most about `most` Gaussians; 0: all.
-    ///
-    /// # Errors
-    /// A tile on disk that cannot be read.
-    pub fn cloud_of(&self, most: usize) -> Result<MapCloud, MapError> {
-        let every = match most {
-            0 => 1,
-            most => self.len().div_ceil(most).max(1),
-        };
-        let mut cloud = MapCloud::empty(self.origin());
-        self.each_tile(|corner, tile| {
-            let live: Vec<_> = tile.live().step_by(every).copied().collect();
-            cloud.push_cells(corner, self.config.voxel_m, &live, true);
-        })?;
-        Ok(cloud)
-    }
-
-    /// One tile as plain arrays.
-    ///
-    /// # Errors
-    /// A tile on disk that cannot be read.
-    pub fn tile_cloud(&self, index: &TileIndex) -> Result<MapCloud, MapError> {
-        let mut cloud = MapCloud::empty(self.origin());
-        self.with_tile(index, |corner, tile| {
-            let live: Vec<_> = tile.live().copied().collect();
-            cloud.push_cells(corner, self.config.voxel_m, &live, true);
-        })?;
-        Ok(cloud)
-    }
-
     /// Calls for every tile that holds something, by index; its corner is relative to the origin.
     fn each_tile(&self, mut visit: impl FnMut(DVec3, &Tile)) -> Result<(), MapError> {
         let mut all: Vec<TileIndex> = self.tiles.iter().map(|t| t.index).chain(self.away().map(|a| a.0)).collect();

@@ -59,3 +59,23 @@ impl TileNews {
         Ok(tiles)
     }
 }
+
+impl StaticMap {
+    /// Tiles that changed after `revision`, by index; all of them for 0. An empty cloud means that nothing is left in
+    /// the tile. Tiles on disk are included as they were saved.
+    ///
+    /// # Errors
+    /// A tile on disk that cannot be read.
+    pub fn changed_since(&self, revision: u64) -> Result<Vec<(TileIndex, MapCloud)>, MapError> {
+        self.changed_tiles(revision).into_iter().map(|index| Ok((index, self.tile_cloud(&index)?))).collect()
+    }
+
+    /// Which tiles [`StaticMap::changed_since`] would give.
+    pub fn changed_tiles(&self, revision: u64) -> Vec<TileIndex> {
+        let here = self.tiles.iter().map(|t| (t.index, t.revision));
+        let away = self.away().map(|(index, revision, _)| (index, revision));
+        let mut changed: Vec<TileIndex> = here.chain(away).filter(|(_, r)| *r > revision).map(|(i, _)| i).collect();
+        changed.sort_unstable();
+        changed
+    }
+}

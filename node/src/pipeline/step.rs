@@ -1,76 +1,37 @@
 //! One step: a window through the network, its pictures, and what it adds to the map and the trajectories.
 
+mod given;
 mod ladder;
+mod parts;
+mod take_in;
 
-use std::collections::VecDeque;
+pub use parts::{OnPart, Part};
+
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
-use storm_model::ModelError;
-use storm_model::scene::{RenderedView, Scene, Want};
+use storm_model::scene::{RenderedView, Scene};
 use storm_render::Intrinsics;
 use tracing::warn;
 
 use crate::config::Config;
-use crate::engine::{Engine, select, views_of};
+use crate::engine::Engine;
 use crate::gate::contract::Notch;
 use crate::gate::predict::PixelFlow;
-use crate::gate::skipper::{Computed, Shadow, SkipCounts, Skipper};
-use crate::map::{MapError, SceneLook, StaticMap};
+use crate::gate::skipper::{Computed, SkipCounts, Skipper};
+use crate::map::{MapError, StaticMap};
 use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
-use crate::overlap::{Agreement, Overlap, OverlapCounts, OverlapLook};
-use crate::rigid::Rigid;
+use crate::overlap::{Agreement, Overlap, OverlapCounts};
 use crate::source::Frame;
 use crate::tracks::{Track, TrackCounts, Tracker};
 use crate::window::Window;
 
 use super::demand::Demand;
-use super::guard::{MOST_IN_A_ROW, StagePanics, caught};
+use super::guard::caught;
 use super::timing::Timings;
-
-/// A surface the map has seen at one place for this long stands, whatever a network under fast ego motion says of its
-/// speed: nothing that moves at a gate of 1 m/s stays in a voxel that long.
-const STANDS_SEC: f64 = 1.0;
-/// Stamps remembered of sets the map was given: those of a window's length at 100 Hz.
-const FUSED_KEPT: usize = 512;
-
-/// A part of a step, in order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Part {
-    /// Deciding whether to compute.
-    Gate,
-    /// The network.
-    Network,
-    /// Comparing with earlier windows.
-    Overlap,
-    /// Drawing.
-    Draw,
-    /// Adding to the map.
-    Map,
-    /// Trajectories and objects.
-    Follow,
-    /// Saving the map.
-    Save,
-}
-
-impl Part {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Gate => "gate",
-            Self::Network => "network",
-            Self::Overlap => "overlap",
-            Self::Draw => "drawing",
-            Self::Map => "map",
-            Self::Follow => "tracking",
-            Self::Save => "saving",
-        }
-    }
-}
-
-/// Called as each part begins: where tests and `storm soak --faults` wait or panic.
-pub type OnPart = Box<dyn FnMut(Part) + Send>;
+use given::Given;
 
 /// What one step gives.
 pub struct Step {
@@ -114,8 +75,8 @@ pub struct StepMaker {
     overlap: Overlap,
     skipper: Skipper,
     timings: Timings,
-    /// Stamps of sets the map was given at their newest; no more than a window holds.
-    fused: VecDeque<i64>,
+    /// Sets the map was given.
+    given: Given,
     steps: u64,
     non_finite: u64,
     part: Part,
@@ -159,7 +120,7 @@ impl StepMaker {
             skipper: Skipper::new(&config.skip),
             config: config.clone(),
             timings: Timings::default(),
-            fused: VecDeque::new(),
+            given: Given::default(),
             steps: 0,
             non_finite: 0,
             part: Part::Gate,
@@ -178,6 +139,7 @@ impl StepMaker {
     /// Takes another map, in the place of the present one, which goes.
     pub fn set_map(&mut self, map: StaticMap) {
         self.skipper.reset();
+        self.given = Given::default();
         self.map = map;
     }
 
@@ -204,61 +166,6 @@ impl StepMaker {
     /// Windows whose result was not finite and was thrown away.
     pub fn non_finite(&self) -> u64 {
         self.non_finite
-    }
-
-    /// Windows lost because a part of the step panicked.
-    pub fn panics(&self) -> u64 {
-        self.panics
-    }
-
-    /// Has `on_part` called as each part of a step begins.
-    pub fn set_on_part(&mut self, on_part: OnPart) {
-        self.on_part = Some(on_part);
-    }
-
-    fn enter(&mut self, part: Part) {
-        self.part = part;
-        if let Some(on_part) = &mut self.on_part {
-            on_part(part);
-        }
-    }
-
-    /// Runs parts of a step. When one panics, what it may have left half done is made anew and the window is dropped,
-    /// counted and said.
-    fn guarded<T>(&mut self, stamp_ns: i64, parts: impl FnOnce(&mut Self) -> Result<T>) -> Result<Option<T>> {
-        match caught(|| parts(self)) {
-            Ok(done) => {
-                self.panics_in_a_row = 0;
-                done.map(Some)
-            }
-            Err(what) => {
-                self.panics += 1;
-                self.panics_in_a_row += 1;
-                let (stage, times) = (self.part.name(), self.panics_in_a_row);
-                warn!("window at {stamp_ns} ns dropped: the {stage} stage panicked ({what}) and starts anew");
-                self.rebuild()?;
-                if times >= MOST_IN_A_ROW {
-                    return Err(StagePanics { stage, times, what }.into());
-                }
-                Ok(None)
-            }
-        }
-    }
-
-    /// Makes anew what the present part changes.
-    fn rebuild(&mut self) -> Result<()> {
-        self.skipper.reset();
-        match self.part {
-            Part::Gate => {}
-            Part::Network | Part::Draw => self.engine.restart()?,
-            Part::Overlap => self.overlap.reset(),
-            Part::Map | Part::Save => self.map.recover(),
-            Part::Follow => {
-                self.tracker.end_all();
-                self.objects.end_all();
-            }
-        }
-        Ok(())
     }
 
     /// Steps that were not computed, and how the checks of them went.
@@ -310,108 +217,6 @@ impl StepMaker {
 
     fn result(&mut self, step: Option<Step>) -> StepResult {
         StepResult { step, tracks: self.ended_tracks(), objects: self.ended_objects() }
-    }
-
-    /// What follows the network; `shadow` belongs to the gate.
-    fn take_in(
-        &mut self,
-        window: Window<Frame>,
-        ran: Ran,
-        demand: Demand,
-        shadow: Option<&Shadow>,
-    ) -> Result<Option<Step>> {
-        let start = Instant::now();
-        let Ran { scene, ms: network_ms, approximate } = ran;
-        self.timings.add("network", network_ms);
-        let mut scene = match scene {
-            Ok(scene) => scene,
-            Err(e) => match e.downcast_ref::<ModelError>() {
-                Some(ModelError::NonFinite { .. }) => {
-                    self.non_finite += 1;
-                    warn!("window at {} ns dropped: {e:#}", window.stamp_ns);
-                    return Ok(None);
-                }
-                _ => return Err(e),
-            },
-        };
-        // A network told to may give the newest timestep alone.
-        let given = &window.steps[window.steps.len() - scene.shape.timesteps.min(window.steps.len())..];
-        let poses: Vec<Rigid> = given.iter().flat_map(|s| s.frames.iter().map(|f| f.map_from_camera)).collect();
-        let stamps_ns: Vec<i64> = given.iter().map(|s| s.stamp_ns).collect();
-        self.enter(Part::Overlap);
-        let look = OverlapLook {
-            stamps_ns: &stamps_ns,
-            epoch: window.epoch,
-            map_from_anchor: &window.map_from_anchor,
-            cameras: &self.cameras,
-            poses: &poses,
-        };
-        let agreement = self.timings.time("overlap", || self.overlap.step(&mut scene, &look));
-        let newest = window.steps.len() - 1;
-        let views = if demand.drawn() || self.skipper.wants_views() {
-            self.enter(Part::Draw);
-            let targets = views_of(&window.steps[newest], &window.map_from_anchor, &self.cameras);
-            let time_sec = newest_time_sec(&window);
-            let want = Want { flow: true, motion: demand.motion };
-            self.timings.time("render", || self.engine.render(&scene, &targets, time_sec, want))?
-        } else {
-            Vec::new()
-        };
-        self.enter(Part::Map);
-        if demand.map {
-            let first_new = self.first_new(&stamps_ns);
-            let look = SceneLook {
-                stamp_ns: window.stamp_ns,
-                map_from_anchor: &window.map_from_anchor,
-                scene: &scene,
-                cameras: &self.cameras,
-                poses: &poses,
-                rendered: &views,
-                confidence: &agreement.geometry,
-                first_new,
-            };
-            self.timings.time("map", || self.map.fuse_scene(&look));
-        } else {
-            // What is published relative to the map's origin needs one all the same.
-            self.map.set_origin(window.map_from_anchor.translation);
-        }
-        let (scene, views, agreement) = (Arc::new(scene), Arc::from(views), Arc::new(agreement));
-        self.enter(Part::Gate);
-        let computed = Computed { window, scene, views, agreement, demand, approximate };
-        self.skipper.computed(&computed, shadow);
-        self.follow(&computed.scene, &computed.window, demand);
-        let total_ms = network_ms + start.elapsed().as_secs_f64() * 1e3;
-        let notch = approximate.then_some(Notch::Approximate);
-        Ok(Some(self.step(computed, demand, notch, total_ms)))
-    }
-
-    /// The first of the newest timesteps that the map was not given before, windows that were skipped left out; it is given them
-    /// now.
-    fn first_new(&mut self, stamps_ns: &[i64]) -> usize {
-        let new = stamps_ns.iter().rev().take_while(|s| !self.fused.contains(s)).count();
-        self.fused.extend(&stamps_ns[stamps_ns.len() - new..]);
-        while self.fused.len() > FUSED_KEPT {
-            self.fused.pop_front();
-        }
-        stamps_ns.len() - new
-    }
-
-    /// What moves, into the trajectories and the objects.
-    fn follow(&mut self, scene: &Scene, window: &Window<Frame>, demand: Demand) {
-        self.enter(Part::Follow);
-        let newest = scene.shape.timesteps - 1;
-        if demand.tracks {
-            let mut points = select::moving_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
-            for p in &mut points {
-                let known = self.map.evidence(p.position_map);
-                p.may_start = known.is_none_or(|k| f64::from(k.seen_for_sec) < STANDS_SEC);
-            }
-            self.timings.time("tracks", || self.tracker.step(window.stamp_ns, window.epoch, &points));
-        }
-        if demand.objects {
-            let (_, parts) = select::object_points(scene, newest, &window.map_from_anchor, &self.config.tracks);
-            self.timings.time("objects", || self.objects.step(window.stamp_ns, window.epoch, &parts));
-        }
     }
 
     fn step(&mut self, of: Computed, demand: Demand, notch: Option<Notch>, total_ms: f64) -> Step {
@@ -536,5 +341,23 @@ mod tests {
             let missing = results.iter().filter(|r| r.step.is_none()).count();
             assert_eq!((results.len(), missing, maker.panics()), (3, lost, lost as u64));
         }
+    }
+
+    #[test]
+    fn another_map_is_given_what_the_one_before_was() {
+        let mut config = Config::default();
+        config.skip.check_every = 0;
+        let clip = Clip::of_seed(3, (48, 32)).unwrap();
+        let source = ModelSource::open(&config.model).unwrap();
+        let engine = Engine::new(source, &config.model, 3, config.window.timespan_sec).unwrap();
+        let mut maker = StepMaker::new(engine, clip.cameras.clone(), &config, None).unwrap();
+        maker.run(clip.window.clone()).unwrap();
+        let whole = maker.map().len();
+        let revision = maker.map().revision();
+        maker.run(clip.window.clone()).unwrap();
+        assert_eq!((maker.map().len(), maker.map().revision()), (whole, revision + 1), "nothing in it is new");
+        maker.set_map(StaticMap::new(&config.map));
+        maker.run(clip.window.clone()).unwrap();
+        assert!(whole > 0 && 10 * maker.map().len() >= 9 * whole, "{} of {whole}", maker.map().len());
     }
 }

@@ -254,18 +254,23 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
-    /// The device is lost while Gaussians are loaded: their name stays good, the pictures are the CPU's, and it is said once.
-    #[test]
-    fn a_lost_device_falls_back_to_the_cpu_with_one_warning() {
-        let gpu = match GpuRasterizer::new(RasterSettings::default(), &GpuOptions::default()) {
-            Ok(gpu) => gpu,
+    /// A device; none, after saying SKIPPED, where there is none and none is required.
+    fn opened() -> Option<GpuRasterizer> {
+        match GpuRasterizer::new(RasterSettings::default(), &GpuOptions::default()) {
+            Ok(gpu) => Some(gpu),
             Err(error) => {
                 let required = std::env::var("REQUIRE_GPU_ADAPTER").is_ok_and(|value| value == "1");
                 assert!(!required, "REQUIRE_GPU_ADAPTER=1, but: {error}");
                 println!("SKIPPED: no wgpu adapter ({error})");
-                return;
+                None
             }
-        };
+        }
+    }
+
+    /// The device is lost while Gaussians are loaded: their name stays good, the pictures are the CPU's, and it is said once.
+    #[test]
+    fn a_lost_device_falls_back_to_the_cpu_with_one_warning() {
+        let Some(gpu) = opened() else { return };
         let splats = Splats {
             means: &[[0.0, 0.0, 5.0], [0.3, 0.1, 4.0]],
             quats: &[[1.0, 0.0, 0.0, 0.0]; 2],
@@ -308,16 +313,7 @@ mod tests {
 
     #[test]
     fn a_lost_device_is_an_error_to_act_on() {
-        let open = || GpuRasterizer::new(RasterSettings::default(), &GpuOptions::default());
-        let mut gpu = match open() {
-            Ok(gpu) => gpu,
-            Err(error) => {
-                let required = std::env::var("REQUIRE_GPU_ADAPTER").is_ok_and(|value| value == "1");
-                assert!(!required, "REQUIRE_GPU_ADAPTER=1, but: {error}");
-                println!("SKIPPED: no wgpu adapter ({error})");
-                return;
-            }
-        };
+        let Some(mut gpu) = opened() else { return };
         let splats = Splats {
             means: &[[0.0, 0.0, 5.0]],
             quats: &[[1.0, 0.0, 0.0, 0.0]],
@@ -337,6 +333,6 @@ mod tests {
         }
         assert!(matches!(gpu.render_uploaded(&[view]), Err(RenderError::Gpu(GpuError::DeviceLost { .. }))));
         drop(gpu);
-        assert!(open().unwrap().render(&splats, &[view]).is_ok(), "opened again");
+        assert!(opened().unwrap().render(&splats, &[view]).is_ok(), "opened again");
     }
 }

@@ -161,12 +161,18 @@ impl Kernel for Task<'_> {
             let at = (batch * shape.tokens + first + r) * shape.width() + head * d;
             // SAFETY: batch, head and query block identify the task, so no other task writes these columns of this row.
             let row = unsafe { self.out.row(at, d) };
-            let scale = 1.0 / total[r];
-            for (c, part) in row.chunks_mut(nr).enumerate() {
-                let from = &sums[(c * BLOCK_QUERIES + r) * nr..][..part.len()];
-                part.iter_mut().zip(from).for_each(|(o, s)| *o = s * scale);
-            }
+            put_row(row, sums, (BLOCK_QUERIES, r), nr, total[r]);
         }
+    }
+}
+
+/// A query's result from its sums, row `r` of panels of `rows` rows and `nr` columns, over its weights' total.
+#[inline(always)]
+fn put_row(row: &mut [f32], sums: &[f32], (rows, r): (usize, usize), nr: usize, total: f32) {
+    let scale = 1.0 / total;
+    for (c, part) in row.chunks_mut(nr).enumerate() {
+        let from = &sums[(c * rows + r) * nr..][..part.len()];
+        part.iter_mut().zip(from).for_each(|(o, s)| *o = s * scale);
     }
 }
 

@@ -11,7 +11,7 @@ use std::cell::{Cell, RefCell};
 use rayon::prelude::*;
 
 use super::pack::{Inputs, Layout, Shape, Source, larger, logit_scale};
-use super::{BLOCK_KEYS, BLOCK_QUERIES, Output, start_at, whole_blocks};
+use super::{BLOCK_KEYS, BLOCK_QUERIES, Output, put_row, start_at, whole_blocks};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
 use crate::kernels::gemm::integer::{factors_of, largest_of, quantise, row_factors};
@@ -212,11 +212,7 @@ impl Kernel for Task<'_> {
                 let at = (batch * shape.tokens + first + start + r) * shape.width() + head * d;
                 // SAFETY: batch, head and query block identify the task, so no other task writes these columns of this row.
                 let row = unsafe { self.out.row(at, d) };
-                let scale = 1.0 / total[r];
-                for (c, part) in row.chunks_mut(nr).enumerate() {
-                    let from = &sums[(c * MR + r) * nr..][..part.len()];
-                    part.iter_mut().zip(from).for_each(|(o, s)| *o = s * scale);
-                }
+                put_row(row, sums, (MR, r), nr, total[r]);
             }
         }
     }

@@ -42,8 +42,6 @@ pub(in crate::cmd) struct Setting {
     pub dtype: String,
     /// Configuration keys it changes.
     pub skips: Vec<String>,
-    /// Steps that were skipped while timing: none, these are full steps.
-    pub skipped: u64,
     pub tokens: usize,
     pub gflop: f64,
     pub gaussians: usize,
@@ -148,7 +146,6 @@ pub(super) fn measure(
         setting: name.into(),
         dtype: config.model.precision.clone(),
         skips: set.to_vec(),
-        skipped: 0,
         tokens: work.tokens,
         gflop: work.flops * 1e-9,
         gaussians,

@@ -329,7 +329,6 @@ mod tests {
             setting: name.into(),
             dtype: "f32".into(),
             skips: Vec::new(),
-            skipped: 0,
             tokens: 1172,
             gflop: 10.0,
             gaussians: 1,

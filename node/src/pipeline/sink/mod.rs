@@ -91,6 +91,8 @@ pub struct Sink {
     objects: Option<ObjectsWriter>,
     /// What could not be written.
     problems: Vec<String>,
+    /// What outputs.mcap had published when it was given up.
+    published: Published,
     /// The first ones, for the report.
     drawn: Vec<TrackRow>,
 }
@@ -122,6 +124,7 @@ impl Sink {
             tracks: Some(TracksWriter::create(&out.join("tracks.csv"))?),
             objects: Some(ObjectsWriter::create(&out.join("objects.csv"))?),
             problems: Vec::new(),
+            published: Published::default(),
             drawn: Vec::new(),
         })
     }
@@ -146,8 +149,7 @@ impl Sink {
                 if let Some(publisher) = &mut self.publisher {
                     let config = &self.config;
                     if let Err(e) = self.timings.time("publish map", || publisher.map_update(&update, config)) {
-                        self.publisher = None;
-                        self.gave_up("outputs.mcap at a map update", &e);
+                        self.gave_up_bag("outputs.mcap at a map update", &e);
                     }
                 }
             }
@@ -158,8 +160,7 @@ impl Sink {
                 if let Some(publisher) = &mut self.publisher {
                     let (rig, config) = (&self.rig, &self.config);
                     if let Err(e) = self.timings.time("publish", || publisher.step(&step, rig, config)) {
-                        self.publisher = None;
-                        self.gave_up(&format!("outputs.mcap after step {}", step.index), &e);
+                        self.gave_up_bag(&format!("outputs.mcap after step {}", step.index), &e);
                     }
                 }
                 self.gallery.offer(&step);
@@ -172,9 +173,14 @@ impl Sink {
     }
 
     fn gave_up(&mut self, what: &str, e: &anyhow::Error) {
-        let line = format!("{what} could not be written: {e:#}");
-        warn!("{line}");
-        self.problems.push(line);
+        gave_up(&mut self.problems, what, e);
+    }
+
+    fn gave_up_bag(&mut self, what: &str, e: &anyhow::Error) {
+        if let Some(publisher) = self.publisher.take() {
+            self.published = publisher.counts();
+        }
+        self.gave_up(what, e);
     }
 
     fn write_objects(&mut self, ended: &[MovingObject]) {
@@ -217,13 +223,11 @@ impl Sink {
     ) -> Result<Metrics> {
         self.write_tracks(&finished.tracks);
         self.write_objects(&finished.objects);
-        let Self { out, config, publisher, scorer, gallery, poses, tracks, objects, drawn: rows, mut problems, .. } =
-            self;
+        let Self { out, config, publisher, scorer, gallery, poses, tracks, objects, drawn: rows, .. } = self;
+        let (mut problems, mut published) = (self.problems, self.published);
         let mut written = |what: &str, done: Result<()>| {
             if let Err(e) = done {
-                let line = format!("{what} could not be written: {e:#}");
-                warn!("{line}");
-                problems.push(line);
+                gave_up(&mut problems, what, &e);
             }
         };
         written("tracks.csv", tracks.map_or(Ok(()), |t| Ok(t.finish()?)));
@@ -246,8 +250,8 @@ impl Sink {
         written("trajectory.tum", write_tum(&place("trajectory.tum"), poses.iter().copied()).map_err(Into::into));
         let yaml = config.to_yaml();
         written("config.yaml", write_bytes(&place("config.yaml"), yaml.as_bytes()).map_err(Into::into));
-        let mut published = Published::default();
         if let Some(publisher) = publisher {
+            published = publisher.counts();
             let done = publisher.finish(&cloud, origin, &poses, &config);
             written("the end of outputs.mcap", done.map(|counts| published = counts));
         }
@@ -311,6 +315,12 @@ impl Sink {
         metrics.problems.extend(late);
         Ok(metrics)
     }
+}
+
+fn gave_up(problems: &mut Vec<String>, what: &str, e: &anyhow::Error) {
+    let line = format!("{what} could not be written: {e:#}");
+    warn!("{line}");
+    problems.push(line);
 }
 
 fn track_rows(track: &Track) -> impl Iterator<Item = TrackRow> + '_ {

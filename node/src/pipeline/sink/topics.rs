@@ -126,6 +126,11 @@ impl Publisher {
         Ok(())
     }
 
+    /// What became of the values so far.
+    pub fn counts(&self) -> Published {
+        self.counts
+    }
+
     /// Writes the map, its frame, and the trajectory, then the bag's index.
     pub fn finish(
         mut self,

@@ -69,26 +69,29 @@ impl StepMaker {
             let ran = Ran { scene, ms: start.elapsed().as_secs_f64() * 1e3, approximate: true };
             return self.take_in(window, ran, demand, None);
         }
+        // Before the exact step, from which the engine learns what is sky in this very window.
+        let rough = (verdict == Verdict::Check).then(|| self.engine.step(&window, &self.cameras));
+        let rough_ms = start.elapsed().as_secs_f64() * 1e3;
+        let start = Instant::now();
         let scene = self.engine.exact_step(&window, &self.cameras);
         let ran = Ran { scene, ms: start.elapsed().as_secs_f64() * 1e3, approximate: false };
-        if let (Verdict::Check, Ok(exact)) = (verdict, &ran.scene) {
-            let found = self.approximation(&window, exact)?;
+        if let (Some(rough), Ok(exact)) = (rough, &ran.scene) {
+            let start = Instant::now();
+            let found = self.apart(&window, exact, rough.as_ref().ok())?;
+            self.timings.add("shadow", rough_ms + start.elapsed().as_secs_f64() * 1e3);
             self.skipper.approximated(found);
         }
         self.take_in(window, ran, demand, shadow.as_ref())
     }
 
-    /// The window with the configured approximations, in the shadow of the exact step: how the two compare.
-    fn approximation(&mut self, window: &Window<Frame>, exact: &Scene) -> Result<Difference> {
-        let start = Instant::now();
-        let Ok(rough) = self.engine.step(window, &self.cameras) else { return Ok(UNLIKE) };
+    /// How an approximation compares with the exact step of the same window.
+    fn apart(&mut self, window: &Window<Frame>, exact: &Scene, rough: Option<&Scene>) -> Result<Difference> {
+        let Some(rough) = rough else { return Ok(UNLIKE) };
         let newest = &window.steps[window.steps.len() - 1];
         let targets = views_of(newest, &window.map_from_anchor, &self.cameras);
         let (time_sec, want) = (newest_time_sec(window), Want { flow: true, motion: false });
         let mut draw = |scene: &Scene| self.engine.render(scene, &targets, time_sec, want);
-        let found = difference(newest, &draw(exact)?, &draw(&rough)?, Quat::IDENTITY);
-        self.timings.add("shadow", start.elapsed().as_secs_f64() * 1e3);
-        Ok(found)
+        Ok(difference(newest, &draw(exact)?, &draw(rough)?, Quat::IDENTITY))
     }
 
     /// The last computed step drawn at the window's newest time and poses, where that explains its pictures everywhere.

@@ -98,7 +98,7 @@ pub fn run_with_faults(options: &FaultSoak, progress: &dyn Fn(usize)) -> Result<
         dropped: DropReason::ALL.iter().map(|&r| (r.as_str(), status.drops.get(r))).collect(),
         sets: status.sets,
         steps: status.steps,
-        steps_skipped: status.skips.still,
+        steps_skipped: status.skips.skipped(),
         published: seen.steps,
         published_bytes: seen.bytes,
         panicked_steps: status.panicked_steps,
@@ -189,7 +189,7 @@ impl<'a> Car<'a> {
         });
         let rig = Rig::build(described.collect(), &TfTree::new(&config.sync), "", &config.input, size)?;
         let rig = Arc::new(rig);
-        let engine = Engine::new(source, &config.model, cameras, config.window.timespan_sec)?;
+        let engine = Engine::new(source, &config.model, cameras, config.window.timespan_sec)?.with_skips(&config.skip);
         let image =
             |camera| LiveInput { topic: format!("/camera{camera}"), role: Role::Image { camera, compressed: false } };
         // One input more than there are cameras: its decoder looks for a camera there is not, and panics.
