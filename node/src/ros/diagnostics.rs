@@ -133,7 +133,9 @@ impl Report<'_> {
 
     fn losses(&self, now: &Status, before: &Status) -> DiagnosticStatus {
         let mut values: Vec<(String, String)> =
-            vec![("images in".into(), now.images_in.to_string()), ("sets".into(), now.sets.to_string())];
+            [("images in", now.images_in), ("images used", now.images_used), ("sets", now.sets)]
+                .map(|(what, n)| (what.into(), n.to_string()))
+                .into();
         for reason in DropReason::ALL {
             values.push((format!("images dropped, {reason}"), now.drops.get(reason).to_string()));
         }

@@ -36,12 +36,14 @@ pub struct Watchdog {
     silence_sec: f64,
     inputs: Vec<Input>,
     polled_ns: Option<i64>,
+    /// When last no camera sent.
+    quiet_ns: Option<i64>,
 }
 
 impl Watchdog {
     /// For so many inputs; one is silent after `silence_sec` without a message.
     pub fn new(inputs: usize, silence_sec: f64) -> Self {
-        Self { silence_sec, inputs: vec![Input::default(); inputs], polled_ns: None }
+        Self { silence_sec, inputs: vec![Input::default(); inputs], polled_ns: None, quiet_ns: None }
     }
 
     /// Another limit from now on, seconds.
@@ -83,14 +85,20 @@ impl Watchdog {
 
     /// Which of the first `cameras` inputs to go on with: those that are not silent, as long as one of them still sends.
     /// None when nothing does (all have been stopped, or are just about to be silent too): nothing is gained by a change.
-    pub fn lively(&self, cameras: usize, now_ns: i64) -> Option<Vec<usize>> {
+    /// None also for as long as the silence limit after such a stop, since cameras do not come back all at once.
+    pub fn lively(&mut self, cameras: usize, now_ns: i64) -> Option<Vec<usize>> {
         let silent = |i: &usize| self.inputs.get(*i).is_none_or(|input| input.silent);
         let left: Vec<usize> = (0..cameras).filter(|i| !silent(i)).collect();
         let sends = |i: &usize| {
             let last_ns = self.inputs.get(*i).and_then(|input| input.last_ns);
             last_ns.is_some_and(|l| (now_ns.saturating_sub(l) as f64) * 1e-9 < LIVELY_SHARE * self.silence_sec)
         };
-        left.iter().any(sends).then_some(left)
+        if !left.iter().any(sends) {
+            self.quiet_ns = Some(now_ns);
+        }
+        // A clock that went back ends the wait.
+        let waits = |q: i64| (0.0..=self.silence_sec).contains(&(now_ns.saturating_sub(q) as f64 * 1e-9));
+        (!self.quiet_ns.is_some_and(waits)).then_some(left)
     }
 }
 
@@ -123,6 +131,25 @@ mod tests {
         assert_eq!(w.poll(SEC * 15 / 10), [Change::Back { input: 1 }]);
         assert_eq!(w.poll(SEC * 16 / 10), []);
         assert_eq!(watch(&mut w, SEC * 17 / 10, 4 * SEC).len(), 2, "both stop");
+    }
+
+    #[test]
+    fn cameras_that_come_back_one_after_the_other_are_waited_for() {
+        let mut w = Watchdog::new(2, 1.0);
+        let mut seen = Vec::new();
+        for tick in 0..80 {
+            let now_ns = tick * SEC / 10;
+            // Both stop at 1 s; input 0 is back at 3 s, input 1 at 3.8 s; input 1 stops for good at 5 s.
+            let sends = [!(10..30).contains(&tick), !(10..38).contains(&tick) && tick < 50];
+            (0..2).filter(|&i| sends[i]).for_each(|i| w.heard(i, now_ns));
+            w.poll(now_ns);
+            if let Some(lively) = w.lively(2, now_ns)
+                && seen.last() != Some(&lively)
+            {
+                seen.push(lively);
+            }
+        }
+        assert_eq!(seen, [vec![0, 1], vec![0]]);
     }
 
     #[test]
