@@ -1,5 +1,6 @@
 //! The end of the line: makes all messages that a node would send of a step, looks at every number, and keeps the times.
 
+use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
@@ -38,24 +39,39 @@ pub struct Seen {
     pub disk_bytes: u64,
 }
 
-/// Stamp and moment of the newest frame pushed: the clock latencies are measured with.
+/// Frames whose moment is remembered: more than a window and all that may wait.
+const REMEMBERED: usize = 1024;
+
+/// Stamps and moments of the newest frames pushed, oldest first: the clock latencies are measured with. Stamps jump, moments do not.
 #[derive(Debug)]
-pub struct PushClock(Mutex<(i64, Instant)>);
+pub struct PushClock(Mutex<VecDeque<(i64, Instant)>>);
 
 impl PushClock {
     pub fn new() -> Arc<Self> {
-        Arc::new(Self(Mutex::new((0, Instant::now()))))
+        Arc::new(Self(Mutex::new([(0, Instant::now())].into())))
     }
 
     /// A frame of this stamp is pushed now.
     pub fn pushed(&self, stamp_ns: i64) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (stamp_ns, Instant::now());
+        let mut frames = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        frames.push_back((stamp_ns, Instant::now()));
+        if frames.len() > REMEMBERED {
+            frames.pop_front();
+        }
     }
 
     /// The stamp a frame would have that is pushed now.
     pub fn now_ns(&self) -> i64 {
-        let (stamp_ns, at) = *self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        stamp_ns.saturating_add(at.elapsed().as_nanos() as i64)
+        let frames = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        frames.back().map_or(0, |(stamp_ns, at)| stamp_ns.saturating_add(at.elapsed().as_nanos() as i64))
+    }
+
+    /// How long ago the frame of this stamp was pushed, milliseconds: the nearest one, since cameras' stamps differ within a frame,
+    /// and of stamps that came twice the newer.
+    pub fn age_ms(&self, stamp_ns: i64) -> f64 {
+        let frames = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let nearest = frames.iter().rev().min_by_key(|(pushed_ns, _)| pushed_ns.abs_diff(stamp_ns));
+        nearest.map_or(0.0, |(_, at)| at.elapsed().as_secs_f64() * 1e3)
     }
 }
 
@@ -102,14 +118,14 @@ impl Outlet for Sink {
         nonfinite += bad(g.opacities.iter().copied()) + bad(g.velocity_forward.iter().flatten().copied());
         nonfinite += maker.tracks().iter().filter(|t| !t.end().position_map.is_finite()).count() as u64;
         let newest_ns = step.window.steps.last().and_then(|s| s.frames.iter().map(|f| f.stamp_ns).max());
-        let age_ns = newest_ns.map_or(0, |newest_ns| self.clock.now_ns().saturating_sub(newest_ns));
+        let age_ms = newest_ns.map_or(0.0, |newest_ns| self.clock.age_ms(newest_ns));
         let map = maker.map();
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         seen.steps += 1;
         seen.bytes += bytes;
         seen.nonfinite += nonfinite + counts.non_finite;
         seen.withheld += counts.withheld;
-        seen.latency_ms.push((age_ns as f64 * 1e-6) as f32);
+        seen.latency_ms.push(age_ms as f32);
         let c = map.counts();
         (seen.spilled, seen.evicted, seen.spill_failed, seen.tiles_lost) =
             (c.spilled, c.evicted, c.spill_failed, c.tiles_lost);
@@ -124,4 +140,22 @@ impl Outlet for Sink {
     fn configure(&mut self, _: &Config) {}
 
     fn times(&mut self, _: &[(&'static str, f64)]) {}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    #[test]
+    fn ages_are_of_the_frame_whatever_its_stamps_did_since() {
+        let clock = PushClock::new();
+        clock.pushed(1_000_000_000);
+        std::thread::sleep(Duration::from_millis(30));
+        clock.pushed(100_000_000_000);
+        clock.pushed(2_000_000_000);
+        let [first, jumped, back] =
+            [1_010_000_000, 100_000_000_000, 2_000_000_000].map(|stamp_ns| clock.age_ms(stamp_ns));
+        assert!(jumped >= back && first - jumped >= 29.0, "{first} {jumped} {back}");
+    }
 }
