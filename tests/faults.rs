@@ -84,6 +84,27 @@ fn a_file_that_cannot_grow_is_given_up_and_everything_else_is_whole() {
     assert_eq!(code(&storm(&["map", out.join("map").to_str().unwrap()])), 0);
 }
 
+/// Its own words are the least a run can lose: a log on a full disk, a pipe nobody reads any more.
+#[cfg(target_os = "linux")]
+#[test]
+fn what_cannot_be_said_ends_no_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let (bag, out) = (dir.path().join("bag.mcap"), dir.path().join("out"));
+    Maker::default().write(&bag);
+    let full = || Stdio::from(std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap());
+    let run = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_storm"));
+        command.args(arguments).env("RUST_LOG", "debug").stdout(full()).stderr(full());
+        command.status().unwrap().code()
+    };
+    let (bag, out_text) = (bag.to_str().unwrap(), out.to_str().unwrap());
+    assert_eq!(run(&["replay", bag, "--out", out_text]), Some(0));
+    assert!(out.join("metrics.json").exists() && out.join("map.ply").exists());
+    assert_eq!(run(&["info", bag]), Some(0));
+    assert_eq!(run(&["config"]), Some(0));
+    assert_eq!(run(&["replay", "nothing.mcap", "--out", out_text]), Some(2), "errors keep their code");
+}
+
 /// A real file system of 3 MB, where mounting one is allowed.
 #[cfg(target_os = "linux")]
 #[test]

@@ -15,6 +15,6 @@ pub struct Args {
 
 /// Prints the defaults.
 pub fn run(args: &Args) -> Result<Outcome> {
-    print!("{}", if args.markdown { Config::markdown() } else { Config::documented_yaml() });
+    say_text!("{}", if args.markdown { Config::markdown() } else { Config::documented_yaml() });
     Ok(Outcome::Done)
 }

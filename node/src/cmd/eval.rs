@@ -124,16 +124,16 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let figures = evaluation.figures();
     let named: Vec<(&str, _)> = figures.iter().map(|(method, figures)| (method.name(), figures)).collect();
     if weights == UNTRAINED {
-        eprintln!("weights: untrained. Seeded random weights stand in; the network's figures mean nothing");
+        complain!("weights: untrained. Seeded random weights stand in; the network's figures mean nothing");
     }
-    println!(
+    say!(
         "weights: {weights}; {}; {} held-out pictures of {}x{} pixels",
         data.describe(),
         evaluation.images(),
         size.0,
         size.1
     );
-    print!("{}", table::text(&named));
+    say_text!("{}", table::text(&named));
     if let Some(path) = &args.markdown {
         write(path, &table::markdown(&named))?;
     }

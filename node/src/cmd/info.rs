@@ -31,20 +31,20 @@ pub fn run(args: &Args) -> Result<Outcome> {
         (Some(start), Some(end)) => (end as f64 - start as f64) * 1e-9,
         _ => 0.0,
     };
-    println!("{}: {} messages over {seconds:.2} s", args.bag.display(), bag.message_count());
+    say!("{}: {} messages over {seconds:.2} s", args.bag.display(), bag.message_count());
     for t in bag.topics() {
-        println!("  {:>7}  {}  {} ({})", t.count, t.name, t.type_name, t.serialization);
+        say!("  {:>7}  {}  {} ({})", t.count, t.name, t.type_name, t.serialization);
     }
     let problems = bag.problems();
-    problems.iter().for_each(|p| println!("problem: {p}"));
+    problems.iter().for_each(|p| say!("problem: {p}"));
     let plan = TopicPlan::resolve(bag.topics(), &config.input)?;
     for (i, c) in plan.cameras.iter().enumerate() {
-        println!("camera {i}: {} with {}", c.name, bag.topics()[c.info].name);
+        say!("camera {i}: {} with {}", c.name, bag.topics()[c.info].name);
     }
     match plan.pose {
-        PoseTopic::Message(t) => println!("pose: {}", bag.topics()[t].name),
-        PoseTopic::Tf => println!("pose: /tf, {} from the vehicle frame", config.input.map_frame),
+        PoseTopic::Message(t) => say!("pose: {}", bag.topics()[t].name),
+        PoseTopic::Tf => say!("pose: /tf, {} from the vehicle frame", config.input.map_frame),
     }
-    println!("ground truth: {} topics", plan.truth.len());
+    say!("ground truth: {} topics", plan.truth.len());
     Ok(if problems.is_empty() { Outcome::Done } else { Outcome::Lost })
 }

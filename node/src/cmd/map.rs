@@ -25,10 +25,10 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<Outcome> {
     let (map, problems) = StaticMap::open(&args.map, args.salvage)?;
     for problem in &problems {
-        eprintln!("lost: {problem}");
+        complain!("lost: {problem}");
     }
     let o = map.origin();
-    println!(
+    say!(
         "{} Gaussians in {} tiles of {} m, finest voxels {} m, {:.1} MB on disk; origin {} {} {}; {} windows",
         map.len(),
         map.tile_count(),

@@ -1,5 +1,8 @@
 //! The commands of the program `storm`: each file parses its own arguments and calls the library.
 
+#[macro_use]
+mod say;
+
 mod bench;
 mod config;
 mod demo;
@@ -122,7 +125,7 @@ impl Cli {
             Command::Config(a) => config::run(&a),
         };
         result.unwrap_or_else(|e| {
-            eprintln!("error: {e:#}");
+            complain!("error: {e:#}");
             let usage = e.chain().any(|c| c.is::<ConfigError>() || c.is::<UsageError>());
             if usage { Outcome::Usage } else { Outcome::Input }
         })
@@ -146,6 +149,8 @@ fn start_log(quiet: bool) {
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         .without_time()
+        // Said by a macro that panics when the standard error cannot be written to.
+        .log_internal_errors(false)
         .try_init();
 }
 

@@ -82,16 +82,16 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         seed: args.seed,
     };
     let bar = progress_bar(progress, args.iterations, "refining");
-    println!("iteration   seconds   fitted PSNR dB   held-out PSNR dB");
+    say!("iteration   seconds   fitted PSNR dB   held-out PSNR dB");
     let report = refine(&mut params, &shots, RasterSettings::default(), &options, &mut |done, score| {
         bar.set_position(done);
         if let Some(s) = score {
-            bar.suspend(|| println!("{}", line(s)));
+            bar.suspend(|| say!("{}", line(s)));
         }
         !stop.load(Ordering::Relaxed)
     })?;
     bar.finish_and_clear();
-    println!(
+    say!(
         "{} Gaussians, {} pictures fitted, {} held out, {:.0} % of their pixels covered",
         report.gaussians,
         report.fitted,
@@ -99,7 +99,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         100.0 * report.covered
     );
     write(args, &config, &params, &saved, &report)?;
-    println!("{}", args.out.join("map.ply").display());
+    say!("{}", args.out.join("map.ply").display());
     Ok(Outcome::Done)
 }
 

@@ -151,7 +151,7 @@ pub fn run(args: &Args) -> Result<Outcome> {
             saved.map_from_local.translation
         );
     }
-    println!("{}", args.out.display());
+    say!("{}", args.out.display());
     Ok(Outcome::Done)
 }
 

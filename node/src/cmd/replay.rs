@@ -79,16 +79,20 @@ pub(super) fn run_into(bag: &Path, out: &Path, config: Config, batch: usize, pro
     });
     bar.finish_and_clear();
     let metrics = metrics?;
-    println!("{}", out.join("report.html").display());
-    println!(
+    say!("{}", out.join("report.html").display());
+    say!(
         "{} frames, {} steps, {} map Gaussians, {} trajectories; weights: {}",
-        metrics.frames_in, metrics.steps, metrics.map_gaussians, metrics.tracks, metrics.weights
+        metrics.frames_in,
+        metrics.steps,
+        metrics.map_gaussians,
+        metrics.tracks,
+        metrics.weights
     );
     if let Some(s) = &metrics.held_out {
-        println!("{}", s.line());
+        say!("{}", s.line());
     }
     if metrics.lost() {
-        eprintln!("lost: {}", metrics.loss_line());
+        complain!("lost: {}", metrics.loss_line());
         return Ok(Outcome::Lost);
     }
     Ok(Outcome::Done)

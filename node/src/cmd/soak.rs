@@ -124,9 +124,9 @@ fn with_faults(args: &Args, options: FaultSoak, progress: bool) -> Result<Outcom
 }
 
 fn print_faults(r: &FaultReport) {
-    println!("seed {}: {:.0} s in {:.0} s; faults {:?}", r.seed, r.seconds, r.wall_sec, r.injected);
-    println!("{} images sent, {} used, dropped {:?}", r.images_sent, r.images_used, r.dropped);
-    println!(
+    say!("seed {}: {:.0} s in {:.0} s; faults {:?}", r.seed, r.seconds, r.wall_sec, r.injected);
+    say!("{} images sent, {} used, dropped {:?}", r.images_sent, r.images_used, r.dropped);
+    say!(
         "{} sets, {} steps ({} not computed), {} published, {:.0} MB; {} windows lost to panics, {} clock jumps, {} poses refused",
         r.sets,
         r.steps,
@@ -137,13 +137,18 @@ fn print_faults(r: &FaultReport) {
         r.epochs,
         r.poses_rejected
     );
-    println!(
+    say!(
         "map: {} Gaussians saved, {} tiles put to disk, {} Gaussians given up, {} tiles refused by the disk, {} tiles lost, {} saves failed",
-        r.saved_gaussians, r.spilled, r.evicted, r.spill_failed, r.tiles_lost, r.failed_saves
+        r.saved_gaussians,
+        r.spilled,
+        r.evicted,
+        r.spill_failed,
+        r.tiles_lost,
+        r.failed_saves
     );
-    println!("quarter  resident MB (mean, most)   steps   latency ms (p50, p99, most)   map Gaussians   on disk MB");
+    say!("quarter  resident MB (mean, most)   steps   latency ms (p50, p99, most)   map Gaussians   on disk MB");
     for (i, q) in r.quarters.iter().enumerate() {
-        println!(
+        say!(
             "{:7}  {:12.1} {:11.1}   {:5}   {:8.1} {:8.1} {:8.1}   {:13}   {:10.1}",
             i + 1,
             q.rss_mb[0],
@@ -156,28 +161,36 @@ fn print_faults(r: &FaultReport) {
             q.map_disk_mb
         );
     }
-    println!("last quarter against the second: resident {:+.1} %", 100.0 * r.memory_growth);
+    say!("last quarter against the second: resident {:+.1} %", 100.0 * r.memory_growth);
     for c in &r.checks {
-        println!("{:9} {}: {} = {}", if c.ok { "holds" } else { "DOES NOT" }, c.what, c.left, c.right);
+        say!("{:9} {}: {} = {}", if c.ok { "holds" } else { "DOES NOT" }, c.what, c.left, c.right);
     }
 }
 
 fn print(r: &SoakReport) {
-    println!(
+    say!(
         "seed {}: {:.0} s, {:.0} m, {} windows of {} Gaussians, {} threads",
-        r.seed, r.seconds, r.metres, r.steps, r.gaussians, r.threads
+        r.seed,
+        r.seconds,
+        r.metres,
+        r.steps,
+        r.gaussians,
+        r.threads
     );
     for (name, t) in
         [("fuse", &r.fuse_ms), ("overlap", &r.overlap_ms), ("tracks", &r.track_ms), ("objects", &r.object_ms)]
     {
-        println!(
+        say!(
             "{name:8} p50 {:.1} ms, p99 {:.1} ms; processor time p50 {:.1} ms, p99 {:.1} ms",
-            t.p50, t.p99, t.cpu_p50, t.cpu_p99
+            t.p50,
+            t.p99,
+            t.cpu_p50,
+            t.cpu_p99
         );
     }
-    println!("quarter  step p99 ms   processor p99 ms   resident MB (mean, most)   map Gaussians in memory");
+    say!("quarter  step p99 ms   processor p99 ms   resident MB (mean, most)   map Gaussians in memory");
     for (i, q) in r.quarters.iter().enumerate() {
-        println!(
+        say!(
             "{:7}  {:11.1}   {:16.1}   {:12.0} {:10.0}   {:23}",
             i + 1,
             q.step_ms.p99,
@@ -188,14 +201,14 @@ fn print(r: &SoakReport) {
         );
     }
     let g = &r.growth;
-    println!(
+    say!(
         "last quarter against the second: resident {:+.1} %, step p99 {:+.1} %, its processor time {:+.1} %",
         100.0 * g.resident,
         100.0 * g.step_p99,
         100.0 * g.step_cpu_p99
     );
     for (i, m) in r.quarters.iter().map(|q| &q.memory_mb).enumerate() {
-        println!(
+        say!(
             "memory after quarter {}: resident {:.1} MB, allocated {:.1} (unused {:.1}): tiles {:.1}, their index {:.2}, tracks {:.2}, objects {:.2}, overlap {:.1}, sets {:.1}, measurements {:.2}",
             i + 1,
             m.resident,
@@ -210,21 +223,24 @@ fn print(r: &SoakReport) {
             m.measurements
         );
     }
-    println!(
+    say!(
         "map      {} Gaussians, {:.0} MB in memory, {:.0} MB on disk; {:?}",
-        r.map_gaussians, r.map_mb, r.map_disk_mb, r.map
+        r.map_gaussians,
+        r.map_mb,
+        r.map_disk_mb,
+        r.map
     );
-    println!("tracks   {} alive at most; {:?}", r.live_tracks, r.tracks);
+    say!("tracks   {} alive at most; {:?}", r.live_tracks, r.tracks);
     let show = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.3}"));
     if let Some(q) = &r.map_quality {
-        println!(
+        say!(
             "static PSNR at {} held-out poses: window {} dB, map {} dB; covered {}",
             q.pictures,
             show(q.window_psnr),
             show(q.map_psnr),
             show(q.covered)
         );
-        println!(
+        say!(
             "within 0.2 m up to 20 m: accuracy {} (mean error {} m), completeness {}; left by moving things: {} of the mass, {} of the Gaussians",
             show(q.accuracy),
             show(q.error_m),
@@ -235,14 +251,17 @@ fn print(r: &SoakReport) {
     }
     if let Some(m) = &r.motion_quality {
         for (name, s) in [("as given", &m.before), ("after overlap", &m.after)] {
-            println!(
+            say!(
                 "{name:14} of standing pixels {:.4} are said to move ({:.3} m/s on average), of moving ones {:.4} (speed off by {:.3} m/s)",
-                s.still_moving, s.still_error_mps, s.moving_kept, s.moving_error_mps
+                s.still_moving,
+                s.still_error_mps,
+                s.moving_kept,
+                s.moving_error_mps
             );
         }
     }
     if let Some(o) = &r.object_quality {
-        println!(
+        say!(
             "objects  ARI {}, moving pixels covered {}, velocity off by {} m/s, acceleration by {} m/s^2 ({} if said to be 0); {} road users, {:.2} objects and {:.2} switches each",
             show(o.fg_ari),
             show(o.covered),
@@ -255,14 +274,19 @@ fn print(r: &SoakReport) {
         );
     }
     if let Some(t) = &r.track_quality {
-        println!(
+        say!(
             "{} trajectories on road users ({} astray, {:.1} each), {:.2} s long on average; {} switched; velocity off by {:.3} m/s",
-            t.judged, t.astray, t.per_mover, t.mean_life_sec, t.switches, t.velocity_error_mps
+            t.judged,
+            t.astray,
+            t.per_mover,
+            t.mean_life_sec,
+            t.switches,
+            t.velocity_error_mps
         );
         for (name, s) in
             [("chained", &t.tracks), ("constant velocity", &t.constant_velocity), ("true flow", &t.oracle_flow)]
         {
-            println!("{name:18} APD3D {}, OA {}", show(s.apd3d), show(s.occlusion_accuracy));
+            say!("{name:18} APD3D {}, OA {}", show(s.apd3d), show(s.occlusion_accuracy));
         }
     }
 }

@@ -35,8 +35,8 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let failed: Vec<&Case> = cases.iter().filter(|c| !c.passed()).collect();
     let nonfinite: u64 = cases.iter().map(|c| c.nonfinite).sum();
     let table = table(&cases);
-    print!("{table}");
-    println!("{} cases, {} failed, {nonfinite} non-finite values", cases.len(), failed.len());
+    say_text!("{table}");
+    say!("{} cases, {} failed, {nonfinite} non-finite values", cases.len(), failed.len());
     if let Some(path) = &args.markdown {
         std::fs::write(path, &table).with_context(|| format!("cannot write {}", path.display()))?;
     }
@@ -46,7 +46,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
     for case in &failed {
-        eprintln!("failed: {}: {}: {case:?}", case.group, case.name);
+        complain!("failed: {}: {}: {case:?}", case.group, case.name);
     }
     Ok(if failed.is_empty() { Outcome::Done } else { Outcome::Lost })
 }

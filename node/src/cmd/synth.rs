@@ -79,6 +79,6 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     })
     .with_context(|| format!("cannot write {}", args.out.display()))?;
     bar.finish_and_clear();
-    println!("{}", args.out.display());
+    say!("{}", args.out.display());
     Ok(Outcome::Done)
 }

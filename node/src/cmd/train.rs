@@ -192,13 +192,13 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         check(args, &trainer, &device, &mut curves, &mut recordings)?;
     }
     let samples = (done - first) as f64 * trainer.options().batch as f64;
-    println!(
+    say!(
         "{} steps, {seconds:.0} s, {:.2} samples/s, {:.0} % of the time waiting for clips",
         done - first,
         samples / seconds.max(1e-9),
         100.0 * waited / seconds.max(1e-9)
     );
-    println!("{}", args.out.join("weights.safetensors").display());
+    say!("{}", args.out.join("weights.safetensors").display());
     Ok(Outcome::Done)
 }
 

@@ -84,6 +84,13 @@ pub struct Args {
     peer_python: Option<PathBuf>,
 }
 
+/// An argument as a document shows it: of a path from the root, which is this machine's own affair, the last part.
+fn named(argument: String) -> String {
+    let path = Path::new(&argument);
+    let last = path.file_name().filter(|_| path.is_absolute());
+    last.map_or_else(|| argument.clone(), |name| name.to_string_lossy().into_owned())
+}
+
 fn parse_methods(text: &str) -> Result<Vec<Method>, String> {
     if text == "none" { Ok(Vec::new()) } else { Method::parse_list(text) }
 }
@@ -113,14 +120,17 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let bar = progress_bar(progress, steps as u64, "measuring");
     let mut report = Report {
         machine: machine(),
-        command: std::iter::once("storm".to_string()).chain(std::env::args().skip(1)).collect::<Vec<_>>().join(" "),
+        command: std::iter::once("storm".to_string())
+            .chain(std::env::args().skip(1).map(named))
+            .collect::<Vec<_>>()
+            .join(" "),
         load: load(),
         ..Report::default()
     };
-    println!("{}", report.machine["cpu"].as_str().unwrap_or("unknown processor"));
+    say!("{}", report.machine["cpu"].as_str().unwrap_or("unknown processor"));
     let (world_fps, world) = peers::time_world()?;
     report.world = world;
-    println!("drive: {world_fps:.0} images of 240x160 with ground truth per second");
+    say!("drive: {world_fps:.0} images of 240x160 with ground truth per second");
     bar.inc(1);
     for model in &models {
         let base = Named { name: String::new(), set: Vec::new(), large: true }.config(model)?;
@@ -142,7 +152,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             let s = network::measure(model, &row.name, &row.set, &config, &data, &mut references, args.runs)?;
             let text = |x: Option<f64>| x.map_or("-".to_string(), |x| format!("{x:.3}"));
             bar.suspend(|| {
-                println!(
+                say!(
                     "{:6} {:36} {:>6} tokens {:>8.1} GFLOP: step p50 {:>8.1} ms, p99 {:>8.1} ms, network {:>8.1} ms, three views {:>6.1} ms, peak {:.0} MB; against {}: PSNR {} dB, EPE3D {} m/s",
                     s.model,
                     s.setting,
@@ -175,7 +185,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             drives::run(&row.config("tiny")?, share, &mut |part| bar.set_position(from + (10.0 * part) as u64))?;
         bar.suspend(|| {
             for r in &drives.rows {
-                println!(
+                say!(
                     "{:10} {:44} {:>4} steps, {:>4} still, {:>4} predicted, {:>4} approximate: {:>7.1} ms a step, in full {:>7.1} ms: {:.2} times less",
                     r.drive, row.name, r.steps, r.still, r.predicted, r.approximate, r.ms, r.full_ms, r.ratio
                 );
@@ -187,7 +197,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         bar.set_message(format!("cost against {curve}"));
         let p = sizes::measure(curve, size)?;
         bar.suspend(|| {
-            println!("{curve}: {:>6} tokens {:>9.2} GFLOP {:>9.1} ms", p.tokens, p.gflop, p.network_ms);
+            say!("{curve}: {:>6} tokens {:>9.2} GFLOP {:>9.1} ms", p.tokens, p.gflop, p.network_ms);
         });
         report.sizes.push(p);
         bar.inc(1);
@@ -199,10 +209,10 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     bar.finish_and_clear();
     if let Some(peer) = &report.peer_pytorch {
         let seconds = peer["median_s"].as_f64().unwrap_or(f64::NAN);
-        println!("PyTorch f32 at B/8's size: {seconds:.1} s");
+        say!("PyTorch f32 at B/8's size: {seconds:.1} s");
         if let Some(b8) = report.settings.iter().find(|s| s.model == LARGEST) {
             let ours = b8.stages_ms["network"].p50 / 1e3;
-            println!("ours {ours:.1} s; ratio {:.2}", ours / seconds);
+            say!("ours {ours:.1} s; ratio {:.2}", ours / seconds);
         }
     }
     write(args, &report)?;

@@ -153,7 +153,7 @@ impl Recordings {
         }
         let held = held_pictures(model, &clips, device)?;
         let one = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.2}"));
-        println!(
+        say!(
             "step {step}: held-out part of the bags: PSNR {} dB (nearest context picture {} dB), {} pictures",
             one(held.psnr),
             one(held.psnr_nearest),

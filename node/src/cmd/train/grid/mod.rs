@@ -90,8 +90,8 @@ pub fn run(args: &Args, name: GridName, device: &Device, progress: bool) -> Resu
     let results: Vec<(Row, Found)> =
         rows.into_iter().zip(found).filter_map(|(row, found)| found.map(|found| (row, found))).collect();
     report::write(args, name, &results)?;
-    print!("{}", report::table(args, name, &results));
-    println!("{}", args.out.join(format!("{}.md", name.name())).display());
+    say_text!("{}", report::table(args, name, &results));
+    say!("{}", args.out.join(format!("{}.md", name.name())).display());
     Ok(Outcome::Done)
 }
 
