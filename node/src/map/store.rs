@@ -46,8 +46,6 @@ pub(super) struct Store {
     saved: HashMap<TileIndex, Saved, VoxelHash>,
     /// Files that go once a newer index is in place.
     stale: Vec<PathBuf>,
-    /// Files that the next index will name and that may not be on the disk itself yet.
-    unsynced: Vec<PathBuf>,
     /// Whether to wait for the disk before an index names them.
     sync: bool,
     bytes: u64,
@@ -71,8 +69,7 @@ impl Store {
     }
 
     fn empty(dir: &Path) -> Self {
-        let (stale, unsynced) = (Vec::new(), Vec::new());
-        Self { dir: dir.to_owned(), saved: HashMap::default(), stale, unsynced, sync: false, bytes: 0 }
+        Self { dir: dir.to_owned(), saved: HashMap::default(), stale: Vec::new(), sync: false, bytes: 0 }
     }
 
     /// A saved map. Every tile is read once; damaged ones are an error, or left out and named when `salvage` is set.
@@ -149,9 +146,6 @@ impl Store {
         let entry = IndexEntry { index: tile.index, revision: tile.revision, cells, crc };
         let path = self.path(&entry);
         write_bytes(&path, &bytes)?;
-        if self.sync {
-            self.unsynced.push(path);
-        }
         self.discard(&tile.index);
         self.insert(&entry, bytes.len() as u64, false);
         Ok(())
@@ -183,10 +177,10 @@ impl Store {
         index.entries.sort_unstable_by_key(|e| e.index);
         let (path, bytes) = (self.dir.join(INDEX_FILE), encode_index(&index));
         if self.sync {
-            // First the tiles, then the index that names them.
-            sync_files(&self.dir, self.unsynced.iter().map(PathBuf::as_path))?;
+            // First the tiles that no index names yet, and may not be on the disk itself, then the index that names them.
+            let new = self.saved.iter().filter(|(_, s)| !s.listed).map(|(at, s)| self.path(&s.entry(*at)));
+            sync_files(&self.dir, new)?;
             write_bytes_synced(&path, &bytes)?;
-            self.unsynced.clear();
         } else {
             write_bytes(&path, &bytes)?;
         }

@@ -51,8 +51,9 @@ fn write(
 ///
 /// # Errors
 /// A file that cannot be opened or that the disk does not take.
-pub fn sync_files<'a>(dir: &Path, paths: impl IntoIterator<Item = &'a Path>) -> Result<(), OutputError> {
+pub fn sync_files(dir: &Path, paths: impl IntoIterator<Item = impl AsRef<Path>>) -> Result<(), OutputError> {
     for path in paths {
+        let path = path.as_ref();
         match File::open(path) {
             Ok(file) => file.sync_data().map_err(OutputError::io(path))?,
             // Replaced or given up meanwhile: nobody will miss it.
@@ -76,7 +77,7 @@ pub fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), OutputError> {
 pub fn write_bytes_synced(path: &Path, bytes: &[u8]) -> Result<(), OutputError> {
     write(path, true, |out| out.write_all(bytes).map_err(OutputError::io(path)))?;
     match path.parent() {
-        Some(dir) => sync_files(dir, []),
+        Some(dir) => sync_files(dir, [] as [&Path; 0]),
         None => Ok(()),
     }
 }
@@ -109,7 +110,7 @@ mod tests {
         sync_files(dir.path(), [here.as_path(), gone.as_path()]).unwrap();
         write_bytes_synced(&here, b"y").unwrap();
         assert_eq!(std::fs::read(&here).unwrap(), b"y");
-        assert!(sync_files(&gone, []).is_err() || !cfg!(unix));
+        assert!(sync_files(&gone, [] as [&Path; 0]).is_err() || !cfg!(unix));
     }
 
     #[test]
