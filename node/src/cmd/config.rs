@@ -1,6 +1,8 @@
 //! `storm config`: the documented defaults.
 
-use anyhow::Result;
+use std::io::{ErrorKind, Write};
+
+use anyhow::{Context, Result};
 
 use super::Outcome;
 use crate::config::Config;
@@ -15,6 +17,11 @@ pub struct Args {
 
 /// Prints the defaults.
 pub fn run(args: &Args) -> Result<Outcome> {
-    say_text!("{}", if args.markdown { Config::markdown() } else { Config::documented_yaml() });
-    Ok(Outcome::Done)
+    let text = if args.markdown { Config::markdown() } else { Config::documented_yaml() };
+    let mut out = std::io::stdout();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        // Mostly redirected into a file: half a configuration is no configuration. A reader who has seen enough is no loss.
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(e).context("the configuration cannot be written"),
+        _ => Ok(Outcome::Done),
+    }
 }
