@@ -39,6 +39,8 @@ pub struct Report<'a> {
     pub inputs: &'a [InputReport],
     /// The pipeline now and at the last report; none before it runs.
     pub status: Option<(&'a Status, &'a Status)>,
+    /// Subscriptions of each output topic; none before it runs.
+    pub outputs: &'a [(String, usize)],
     /// Device and weights.
     pub device: String,
     /// Now, of the clock that stamps are of, nanoseconds.
@@ -54,6 +56,7 @@ impl Report<'_> {
         if let Some((now, before)) = self.status {
             all.push(self.pipeline(now, before));
             all.push(self.losses(now, before));
+            all.push(self.outputs());
             if self.map {
                 all.push(self.map(now));
             }
@@ -181,6 +184,18 @@ impl Report<'_> {
         self.status("losses", level, message, values)
     }
 
+    fn outputs(&self) -> DiagnosticStatus {
+        let values = self.outputs.iter().map(|(topic, n)| (format!("{topic} subscriptions"), n.to_string())).collect();
+        let heard = self.outputs.iter().filter(|(_, n)| *n > 0).count();
+        let message = match heard {
+            0 => "nobody listens: steps are run, nothing is sent".into(),
+            n => {
+                format!("{n} of {} topics are listened to; what nobody listens to is not computed", self.outputs.len())
+            }
+        };
+        self.status("outputs", OK, message, values)
+    }
+
     fn map(&self, now: &Status) -> DiagnosticStatus {
         let values = vec![
             ("Gaussians".into(), now.map_gaussians.to_string()),
@@ -209,8 +224,15 @@ mod tests {
         let before = Status { steps: 5, ..Status::default() };
         let mut now = Status { steps: 9, superseded: 3, hop_sec: 0.3, ..before.clone() };
         now.drops.add(DropReason::Overflow, 4);
-        let report =
-            |inputs| Report { node: "/storm", inputs, status: Some((&now, &before)), map: true, ..Report::default() };
+        let outputs = [("~/output/flow".to_string(), 2), ("/tf".to_string(), 0)];
+        let report = |inputs| Report {
+            node: "/storm",
+            inputs,
+            outputs: &outputs,
+            status: Some((&now, &before)),
+            map: true,
+            ..Report::default()
+        };
         let statuses = report(&inputs).statuses();
         assert_eq!(level_of(&statuses, "inputs"), (ERROR, "stopped: /cam".into()));
         let (level, message) = level_of(&statuses, "pipeline");
@@ -218,6 +240,8 @@ mod tests {
         let (level, message) = level_of(&statuses, "losses");
         assert!(level == WARN && message.contains("4 images") && message.contains("overflow"), "{message}");
         assert_eq!(level_of(&report(&inputs[1..]).statuses(), "inputs").0, OK);
+        let heard = level_of(&statuses, "outputs");
+        assert!(heard.0 == OK && heard.1.starts_with("1 of 2 topics"), "{heard:?}");
         let waiting = Report { waiting: "no pose on /odom", ..Report::default() }.statuses();
         assert_eq!((waiting.len(), waiting[0].level), (1, WARN));
     }

@@ -50,6 +50,11 @@ impl MapOutput {
         })
     }
 
+    /// Both topics.
+    pub fn topics(&self) -> [&Topic; 2] {
+        [&self.whole, &self.update]
+    }
+
     /// Another map took the place of the one so far: all of it is news, and what was sent of the old one is gone.
     pub fn forget(&mut self) {
         self.whole_sent = None;

@@ -88,6 +88,7 @@ pub fn run(stop: &AtomicBool) -> Result<bool> {
         arrivals: Rc::new(RefCell::new(Vec::new())),
         streams: Vec::new(),
         reports: Vec::new(),
+        outputs: Vec::new(),
         reported: Instant::now(),
         said: None,
         status_before: Status::default(),
@@ -128,6 +129,7 @@ struct Running {
     arrivals: Arrivals,
     streams: Vec<Stream>,
     reports: Vec<InputReport>,
+    outputs: Vec<Topic>,
     reported: Instant,
     said: Option<Instant>,
     status_before: Status,
@@ -254,6 +256,7 @@ impl Running {
                 }
                 self.device = format!("{}, {weights}", self.config.model.device);
                 let outputs = Outputs::new(&mut self.node, rig.clone(), &self.config)?;
+                self.outputs = outputs.topics();
                 let clock = self.clock.clone();
                 let options = LiveOptions {
                     config: self.config.clone(),
@@ -390,10 +393,12 @@ impl Running {
             report.reported = report.received;
         }
         let now_ns = now_ns(&self.clock);
+        let outputs: Vec<_> = self.outputs.iter().map(|t| (self.names.resolve(t.name()), t.listeners())).collect();
         let report = Report {
             node: &self.names.node,
             waiting,
             inputs: &self.reports,
+            outputs: &outputs,
             status: status.map(|now| (now, &self.status_before)),
             device: self.device.clone(),
             now_ns,

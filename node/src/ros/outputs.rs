@@ -126,6 +126,15 @@ impl Outputs {
         })
     }
 
+    /// Handles of the topics that are sent to whoever listens; without the `debug` ones and the latched transform.
+    pub fn topics(&self) -> Vec<Topic> {
+        let of_camera =
+            |c: &'_ CameraOutputs| [&c.rendered, &c.depth, &c.mask, &c.mask_color, &c.info].map(Clone::clone);
+        let single = [&self.gaussians, &self.flow, &self.tracks, &self.objects, &self.path, &self.tf];
+        let all = single.into_iter().chain(&self.detections).chain(self.map.topics()).cloned();
+        all.chain(self.cameras.iter().flat_map(of_camera)).collect()
+    }
+
     fn transforms(&mut self, step: &Step, maker: &StepMaker) -> Result<()> {
         let frame = &self.config.input.map_frame;
         let origin = maker.map().origin();

@@ -7,7 +7,8 @@ use super::qos::offered;
 use crate::cdr::write::EncodeError;
 use crate::output::qos::Qos;
 
-/// One output topic.
+/// One output topic; copies are handles of the same.
+#[derive(Clone)]
 pub struct Topic {
     publisher: PublisherUntyped,
     name: String,
@@ -23,6 +24,11 @@ impl Topic {
             .create_publisher_untyped(name, type_name, offered(qos))
             .with_context(|| format!("cannot publish {name} ({type_name})"))?;
         Ok(Self { publisher, name: name.into() })
+    }
+
+    /// Its name as it was declared.
+    pub fn name(&self) -> &str {
+        &self.name
     }
 
     /// Subscriptions outside of this process.
