@@ -48,12 +48,12 @@ def points(cloud) -> np.ndarray:
     return np.frombuffer(bytes(cloud.data), dtype)
 
 
-def until(done, seconds: float, what: str):
-    """Waits for `done()`; raises when it takes too long."""
+def until(done, seconds: float, what):
+    """Waits for `done()`; raises when it takes too long, saying `what` was waited for (or `what()` as it is then)."""
     end = time.monotonic() + seconds
     while not (value := done()):
         if time.monotonic() > end:
-            raise AssertionError(f"after {seconds} s still no {what}")
+            raise AssertionError(f"after {seconds} s still no {what() if callable(what) else what}")
         time.sleep(0.01)
     return value
 
@@ -128,6 +128,7 @@ class Peer:
         rclpy.init()
         self.node = Node(name)
         self.publishers = {}
+        self.subscriptions = {}
         self.heard = defaultdict(list)
         self.arrived = defaultdict(list)
         self.lock = threading.Lock()
@@ -175,12 +176,18 @@ class Peer:
         until(lambda: all(self.publishers[t].get_subscription_count() > 0 for t in topics), seconds,
               f"subscription on all of {list(topics)}")
 
+    def hears(self, topics, seconds: float = 20.0):
+        """Waits until the subscriptions have found their publishers; what those sent before is lost to them."""
+        until(lambda: all(self.subscriptions[t].get_publisher_count() > 0 for t in topics), seconds,
+              f"publishers of all of {list(topics)}")
+
     def listen(self, topic: str, type_name: str, qos=RELIABLE, keep: bool = True):
         def take(data):
             with self.lock:
                 self.arrived[topic].append(time.time_ns())
                 self.heard[topic].append(data if keep else data[:64])
-        return self.node.create_subscription(get_message(type_name), topic, take, qos, raw=True)
+        self.subscriptions[topic] = self.node.create_subscription(get_message(type_name), topic, take, qos, raw=True)
+        return self.subscriptions[topic]
 
     def count(self, topic: str) -> int:
         with self.lock:
