@@ -25,7 +25,7 @@ use crate::map::{MapError, StaticMap};
 use crate::objects::{MovingObject, ObjectCounts, ObjectTracker};
 use crate::overlap::{Agreement, Overlap, OverlapCounts};
 use crate::source::Frame;
-use crate::tracks::{Track, TrackCounts, Tracker};
+use crate::tracks::{LiveTrack, Track, TrackCounts, Tracker};
 use crate::window::Window;
 
 use super::demand::Demand;
@@ -149,7 +149,7 @@ impl StepMaker {
     }
 
     /// Trajectories alive.
-    pub fn tracks(&self) -> &[Track] {
+    pub fn tracks(&self) -> &[LiveTrack] {
         self.tracker.live()
     }
 

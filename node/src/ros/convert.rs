@@ -6,7 +6,7 @@ use crate::msg::{Detection, Header, Marker, MarkerShape};
 use crate::objects::MovingObject;
 use crate::output::cloud_live::TrackEnd;
 use crate::rigid::Rigid;
-use crate::tracks::Track;
+use crate::tracks::LiveTrack;
 
 /// What all objects are called: nothing says more of them than that they move.
 const CLASS: &str = "moving";
@@ -18,18 +18,18 @@ const ARROW_M: [f64; 3] = [0.15, 0.35, 0.0];
 const MIN_SIZE_M: f64 = 0.05;
 
 /// The newest points of trajectories, relative to `origin` with the map's axes.
-pub fn track_ends(tracks: &[Track], origin: DVec3) -> Vec<TrackEnd> {
-    let end = |t: &Track| {
-        let (first, last) = (t.points.first()?, t.points.last()?);
-        Some(TrackEnd {
+pub fn track_ends(tracks: &[LiveTrack], origin: DVec3) -> Vec<TrackEnd> {
+    let end = |t: &LiveTrack| {
+        let last = t.end();
+        TrackEnd {
             position: (last.position_map - origin).as_vec3().to_array(),
             velocity: last.velocity_map_mps.as_vec3().to_array(),
-            age_sec: (last.stamp_ns.saturating_sub(first.stamp_ns) as f64 * 1e-9) as f32,
+            age_sec: (last.stamp_ns.saturating_sub(t.born_ns()) as f64 * 1e-9) as f32,
             motion_id: last.motion_id,
             id: t.id,
-        })
+        }
     };
-    tracks.iter().filter_map(end).collect()
+    tracks.iter().map(end).collect()
 }
 
 /// The box of an object: centre and size.

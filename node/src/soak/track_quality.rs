@@ -13,7 +13,7 @@ use storm_model::metrics::track::{TrackPoint, TrackScores, track_scores};
 use storm_render::world::{Drive, Mover};
 
 use crate::rigid::Rigid;
-use crate::tracks::Track;
+use crate::tracks::LiveTrack;
 
 use super::oracle::OracleSet;
 
@@ -95,7 +95,7 @@ impl TrackJudge {
     }
 
     /// Takes the trajectories alive after a step.
-    pub fn step(&mut self, drive: &Drive, set: &OracleSet, live: &[Track]) {
+    pub fn step(&mut self, drive: &Drive, set: &OracleSet, live: &[LiveTrack]) {
         let movers = drive.movers(set.time_sec);
         let by_id: HashMap<u64, &Mover> = movers.iter().map(|m| (m.id, m)).collect();
         let views: Vec<(Rigid, usize)> = set.poses.iter().enumerate().map(|(c, p)| (p.inverse(), c)).collect();

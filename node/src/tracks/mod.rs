@@ -7,21 +7,25 @@
 //! moving Gaussians that none passes by, spaced so that one patch of surface does not start many. Only the newest
 //! timestep of a window is taken, so a point that several windows see is one point.
 
+mod grid;
+mod live;
 mod nearest;
 mod spacing;
 mod track;
 
 use std::borrow::Cow;
 
-#[cfg(test)]
 use glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::config::TracksConfig;
 use crate::sync::clock::seconds_between;
+use grid::Grid;
 use nearest::mutual_nearest;
 use spacing::Spacing;
+
+pub use live::LiveTrack;
 pub use track::{Track, TrackPoint, TrackSample};
 
 /// Speeds beyond this are a mistake of the network, m/s; the Gaussian is left out and counted.
@@ -62,7 +66,7 @@ pub struct Tracker {
     stamp_ns: i64,
     next_id: u32,
     /// In order of id.
-    live: Vec<Track>,
+    live: Vec<LiveTrack>,
     finished: Vec<Track>,
     counts: TrackCounts,
 }
@@ -97,8 +101,8 @@ impl Tracker {
         self.go_on(stamp_ns, &usable, &continued);
         let bridge_sec = self.config.bridge_sec;
         self.end_where(|t| seconds_between(t.end().stamp_ns, stamp_ns) > bridge_sec);
-        if self.config.min_points <= track::PIECE_POINTS {
-            self.finished.extend(self.live.iter_mut().filter_map(Track::cut));
+        if self.config.min_points <= live::PIECE_POINTS {
+            self.finished.extend(self.live.iter_mut().filter_map(LiveTrack::cut));
         }
         self.start(stamp_ns, &usable, &continued);
     }
@@ -117,7 +121,7 @@ impl Tracker {
     }
 
     /// Trajectories alive, coasting ones included, in order of id.
-    pub fn live(&self) -> &[Track] {
+    pub fn live(&self) -> &[LiveTrack] {
         &self.live
     }
 
@@ -135,7 +139,7 @@ impl Tracker {
             }
         }
         let config = &self.config;
-        let took = |(track, j): (&mut Track, &u32)| match points.get(*j as usize) {
+        let took = |(track, j): (&mut LiveTrack, &u32)| match points.get(*j as usize) {
             Some(point) if track.looks_like(point, config) => {
                 track.go_on(stamp_ns, point);
                 (1, 0)
@@ -156,8 +160,10 @@ impl Tracker {
 
     /// Memory held, bytes.
     pub fn bytes(&self) -> usize {
-        let lists: usize = self.live.iter().chain(&self.finished).map(Track::bytes).sum();
-        lists + (self.live.capacity() + self.finished.capacity()) * size_of::<Track>()
+        let live: usize = self.live.iter().map(LiveTrack::bytes).sum();
+        let ended: usize = self.finished.iter().map(|t| t.points.capacity() * size_of::<TrackSample>()).sum();
+        let lists = self.live.capacity() * size_of::<LiveTrack>() + self.finished.capacity() * size_of::<Track>();
+        live + ended + lists
     }
 
     /// Starts trajectories at the points that continue none, the most opaque first.
@@ -167,7 +173,7 @@ impl Tracker {
             let opaque = f64::from(p.opacity) >= self.config.min_opacity;
             opaque && p.may_start && p.velocity_map_mps.length() >= self.config.min_speed_mps
         };
-        let mut candidates: Vec<&TrackPoint> =
+        let candidates: Vec<&TrackPoint> =
             points.iter().zip(continued).filter(|(p, c)| c.is_none() && fresh(p)).map(|(p, _)| p).collect();
         if candidates.is_empty() {
             return;
@@ -176,16 +182,24 @@ impl Tracker {
             self.counts.no_room += candidates.len() as u64;
             return;
         }
-        let about = self.live.len() + candidates.len();
-        let mut taken = Spacing::new(self.config.spacing_m, origin, about);
-        self.live.iter().for_each(|t| taken.add(t.predicted(stamp_ns)));
+        // In a cube of twice the spacing one sees at least that far, whichever of its corners one is nearest to.
+        let spacing_m = self.config.spacing_m;
+        let local = |p: DVec3| (p - origin).as_vec3().to_array();
+        let ends =
+            self.live.par_iter().with_min_len(MIN_TRACKS).map(|t| local(t.predicted(stamp_ns))).collect::<Vec<_>>();
+        let standing = Grid::new(&ends, 2.0 * spacing_m as f32);
+        let limit2 = (spacing_m * spacing_m) as f32;
+        let apart = |p: &&TrackPoint| standing.beside(&local(p.position_map), limit2).0.1 >= limit2;
+        let mut candidates: Vec<&TrackPoint> =
+            candidates.into_par_iter().with_min_len(MIN_TRACKS).filter(apart).collect();
+        let mut taken = Spacing::new(spacing_m, origin, candidates.len());
         // Stable, so points equally opaque stay in the caller's order.
         candidates.sort_by(|a, b| b.opacity.total_cmp(&a.opacity));
         for p in candidates {
             if self.live.len() >= self.config.max_active {
                 self.counts.no_room += 1;
             } else if taken.claim(p.position_map) {
-                self.live.push(Track::new(self.next_id, stamp_ns, p));
+                self.live.push(LiveTrack::new(self.next_id, stamp_ns, p));
                 self.next_id = self.next_id.wrapping_add(1);
                 self.counts.born += 1;
             }
@@ -198,12 +212,12 @@ impl Tracker {
         self.epoch = None;
     }
 
-    fn end_where(&mut self, ended: impl Fn(&Track) -> bool) {
+    fn end_where(&mut self, ended: impl Fn(&LiveTrack) -> bool) {
         let min_points = self.config.min_points;
         for track in self.live.extract_if(.., |t| ended(t)) {
             if track.len() >= min_points {
                 self.counts.finished += 1;
-                self.finished.push(track);
+                self.finished.push(track.ended());
             } else {
                 self.counts.too_short += 1;
             }

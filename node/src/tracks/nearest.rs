@@ -8,6 +8,8 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::grid::Grid;
+
 /// Questions asked by one task at least: fewer are not worth a thread.
 const MIN_QUESTIONS: usize = 512;
 
@@ -17,144 +19,6 @@ const FINE_POINTS: f32 = 4.0;
 const DENSE_POINTS: f32 = 8.0;
 /// A coarse cube's edge is at most so many fine ones.
 const FINEST: f32 = 16.0;
-
-/// Points in cubes, the cubes in a table by hash; a place of the table lists its points one after the other.
-struct Grid {
-    inverse_m: f32,
-    cube_m: f32,
-    /// First item of every place, and the end.
-    starts: Vec<u32>,
-    items: Vec<([f32; 3], u32)>,
-}
-
-/// The share of a cube's index along one axis in its place; two's-complement, so that neighbours are one step apart.
-fn mixed(axis: usize, index: i32) -> u32 {
-    (index as u32).wrapping_mul([0x9e37_79b1, 0x85eb_ca77, 0xc2b2_ae3d][axis])
-}
-
-/// The cube's own index along an axis and the place in it, 0 to 1. (`floor` is a call where the processor is not known to
-/// have it.) `as` saturates: what lies too far out shares the outermost cubes.
-fn split(scaled: f32) -> (i32, f32) {
-    let index = (scaled as i32).saturating_sub(i32::from((scaled as i32) as f32 > scaled));
-    (index, scaled - index as f32)
-}
-
-/// Distances to faces count as a little less, for what their computation rounds.
-const NEARLY: f32 = 0.999;
-
-/// Own cube (0) or the one beside it (1) along each axis, the likeliest first.
-const BESIDE: [[usize; 3]; 8] =
-    [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
-
-/// Nearest so far: number, squared distance. Of equals the first counts.
-type Best = (u32, f32);
-
-impl Grid {
-    fn new(points: &[[f32; 3]], cube_m: f32) -> Self {
-        let places = (2 * points.len()).next_power_of_two();
-        let mut grid = Self { inverse_m: 1.0 / cube_m, cube_m, starts: vec![0; places + 1], items: Vec::new() };
-        let at: Vec<u32> = points.iter().map(|p| grid.place(grid.cube(p)) as u32).collect();
-        at.iter().for_each(|&a| grid.starts[a as usize + 1] += 1);
-        for i in 0..places {
-            grid.starts[i + 1] += grid.starts[i];
-        }
-        grid.items = vec![([0.0; 3], 0); points.len()];
-        // Backwards, so that `starts` can count down to what it has to be and items keep their order.
-        let ends = &mut grid.starts[1..];
-        for (i, (p, &a)) in points.iter().zip(&at).enumerate().rev() {
-            ends[a as usize] -= 1;
-            grid.items[ends[a as usize] as usize] = (*p, i as u32);
-        }
-        // Every place's end has become its start: one to the left.
-        grid.starts.copy_within(1.., 0);
-        grid.starts[places] = points.len() as u32;
-        grid
-    }
-
-    fn cube(&self, p: &[f32; 3]) -> [i32; 3] {
-        p.map(|x| split(x * self.inverse_m).0)
-    }
-
-    fn place(&self, [x, y, z]: [i32; 3]) -> usize {
-        (mixed(0, x) ^ mixed(1, y) ^ mixed(2, z)) as usize & (self.starts.len() - 2)
-    }
-
-    /// Points in the same place of the table, averaged over all points.
-    fn crowd(&self) -> f32 {
-        let squares: u64 = self.starts.windows(2).map(|s| u64::from(s[1] - s[0]).pow(2)).sum();
-        squares as f32 / self.items.len().max(1) as f32
-    }
-
-    #[inline]
-    fn look(&self, place: usize, p: &[f32; 3], (mut best, mut best2): Best) -> Best {
-        let items = self.starts[place] as usize..self.starts[place + 1] as usize;
-        for (q, i) in &self.items[items] {
-            let d2 = (q[0] - p[0]).powi(2) + (q[1] - p[1]).powi(2) + (q[2] - p[2]).powi(2);
-            if d2 < best2 || (d2 == best2 && *i < best) {
-                (best, best2) = (*i, d2);
-            }
-        }
-        (best, best2)
-    }
-
-    /// The nearest among the eight cubes around the corner nearest to `p`; false when a nearer one within `within2`
-    /// may lie beyond them.
-    fn beside(&self, p: &[f32; 3], within2: f32) -> (Best, bool) {
-        // Per axis: the share of the own cube and of the one beside it in the place, and how far off that one is.
-        let mut hashes = [[0u32; 2]; 3];
-        let mut apart2 = [0f32; 3];
-        let mut reach = f32::INFINITY;
-        for k in 0..3 {
-            let (own, part) = split(p[k] * self.inverse_m);
-            let beside = own.wrapping_add(if part < 0.5 { -1 } else { 1 });
-            hashes[k] = [mixed(k, own), mixed(k, beside)];
-            apart2[k] = (part.min(1.0 - part) * self.cube_m * NEARLY).powi(2);
-            reach = reach.min(part.max(1.0 - part));
-        }
-        let mut best = (u32::MAX, within2);
-        for [i, j, k] in BESIDE {
-            let axis = |axis: usize, on: usize| if on == 1 { apart2[axis] } else { 0.0 };
-            if axis(0, i) + axis(1, j) + axis(2, k) <= best.1 {
-                let hash = hashes[0][i] ^ hashes[1][j] ^ hashes[2][k];
-                best = self.look(hash as usize & (self.starts.len() - 2), p, best);
-            }
-        }
-        let seen = reach * self.cube_m * NEARLY;
-        (best, best.1 <= seen * seen)
-    }
-
-    /// The nearest point whose squared distance is at most `within2`, with that distance: ring after ring of cubes.
-    fn around(&self, p: &[f32; 3], within2: f32) -> Best {
-        let [x, y, z] = self.cube(p);
-        // How far from the cube's own faces: so much around is seen with the cube, a cube more with every ring.
-        let to_face = |v: f32| {
-            let part = split(v * self.inverse_m).1;
-            part.min(1.0 - part) * self.cube_m
-        };
-        let inner = p.iter().fold(f32::INFINITY, |m, &v| m.min(to_face(v)));
-        let (mut best, mut ring) = ((u32::MAX, within2), 0i32);
-        loop {
-            for dx in -ring..=ring {
-                for dy in -ring..=ring {
-                    // Inside the ring's shell only its two ends.
-                    let shell = dx.abs() == ring || dy.abs() == ring;
-                    let step = if shell { 1 } else { (2 * ring).max(1) };
-                    for dz in (-ring..=ring).step_by(step as usize) {
-                        let cube = [x.wrapping_add(dx), y.wrapping_add(dy), z.wrapping_add(dz)];
-                        best = self.look(self.place(cube), p, best);
-                    }
-                }
-            }
-            let seen = ring as f32 * self.cube_m + inner;
-            // Phrased as what goes on, so that a NaN ends it.
-            if seen * seen <= best.1 {
-                ring += 1;
-            } else {
-                return best;
-            }
-        }
-    }
-}
 
 /// A coarse grid, and a fine one where points are dense.
 struct Finder {
@@ -217,22 +81,20 @@ pub(super) fn mutual_nearest(
     let widest_m = gates_m.iter().copied().fold(0.0, f32::max);
     let cube_m = (usual_m as f32).max(widest_m / 8.0).max(1e-3);
     let (from_finder, to_finder) = finders(&from, &to, cube_m);
-    let found: Vec<Option<usize>> = from
-        .par_iter()
-        .enumerate()
-        .with_min_len(MIN_QUESTIONS)
-        .map(|(i, p)| {
-            let gate_m = gates_m[i];
-            let (at, distance2) = to_finder.nearest(p, gate_m * gate_m)?;
-            // Of predictions at one and the same place the finder names the first; it gets the observation.
-            let (back, _) = from_finder.nearest(&to[at], distance2)?;
-            (back == i).then_some(at)
-        })
-        .collect();
+    // In the order of cubes, so that questions asked one after the other look at the same places.
+    let questions = &from_finder.fine.as_ref().unwrap_or(&from_finder.coarse).items;
+    let answer = |&(ref p, i): &([f32; 3], u32)| {
+        let gate_m = gates_m[i as usize];
+        let (at, distance2) = to_finder.nearest(p, gate_m * gate_m)?;
+        // Of predictions at one and the same place the finder names the first; it gets the observation.
+        let (back, _) = from_finder.nearest(&to[at], distance2)?;
+        (back == i as usize).then_some(at)
+    };
+    let found: Vec<Option<usize>> = questions.par_iter().with_min_len(MIN_QUESTIONS).map(answer).collect();
     let mut matched = none;
-    for (i, at) in found.into_iter().enumerate() {
+    for ((_, i), at) in questions.iter().zip(found) {
         if let Some(slot) = at.and_then(|at| matched.get_mut(at)) {
-            slot.get_or_insert(i);
+            slot.get_or_insert(*i as usize);
         }
     }
     matched
