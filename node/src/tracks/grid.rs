@@ -35,10 +35,8 @@ pub(super) type Best = (u32, f32);
 impl Grid {
     /// `cube_m` is the cubes' edge.
     pub fn new(points: &[[f32; 3]], cube_m: f32) -> Self {
-        let places = points.len().next_power_of_two();
-        let mut grid = Self { inverse_m: 1.0 / cube_m, cube_m, starts: vec![0; places + 1], items: Vec::new() };
-        let at: Vec<u32> = points.iter().map(|p| grid.place(grid.cube(p)) as u32).collect();
-        at.iter().for_each(|&a| grid.starts[a as usize + 1] += 1);
+        let (mut grid, at) = Self::counted(points, cube_m);
+        let places = grid.starts.len() - 1;
         for i in 0..places {
             grid.starts[i + 1] += grid.starts[i];
         }
@@ -55,6 +53,22 @@ impl Grid {
         grid
     }
 
+    /// A grid whose places are counted, each in the start of the next, and the points' places.
+    fn counted(points: &[[f32; 3]], cube_m: f32) -> (Self, Vec<u32>) {
+        let places = points.len().next_power_of_two();
+        let mut grid = Self { inverse_m: 1.0 / cube_m, cube_m, starts: vec![0; places + 1], items: Vec::new() };
+        let at: Vec<u32> = points.iter().map(|p| grid.place(grid.cube(p)) as u32).collect();
+        at.iter().for_each(|&a| grid.starts[a as usize + 1] += 1);
+        (grid, at)
+    }
+
+    /// Points in a cube of such a grid as one of its points sees it: averaged over all points.
+    pub fn crowd(points: &[[f32; 3]], cube_m: f32) -> f32 {
+        let (grid, _) = Self::counted(points, cube_m);
+        let squares: u64 = grid.starts.iter().map(|&n| u64::from(n).pow(2)).sum();
+        squares as f32 / points.len().max(1) as f32
+    }
+
     fn cube(&self, p: &[f32; 3]) -> [i32; 3] {
         p.map(|x| split(x * self.inverse_m).0)
     }
@@ -63,23 +77,17 @@ impl Grid {
         row(y, z).wrapping_add(x as u32) as usize & (self.starts.len() - 2)
     }
 
-    /// Points in the same place of the table, averaged over all points.
-    pub fn crowd(&self) -> f32 {
-        let squares: u64 = self.starts.windows(2).map(|s| u64::from(s[1] - s[0]).pow(2)).sum();
-        squares as f32 / self.items.len().max(1) as f32
-    }
-
     /// The nearest among the points of `places` of the table and `best`.
     #[inline]
-    fn look(&self, places: Range<usize>, p: &[f32; 3], (mut best, mut best2): Best) -> Best {
+    fn look(&self, places: Range<usize>, p: &[f32; 3], best: Best) -> Best {
         let items = self.starts[places.start] as usize..self.starts[places.end] as usize;
+        // Bits of floats that are not negative are ordered as they are: one number to compare, and no branch to guess.
+        let mut key = u64::from(best.1.to_bits()) << 32 | u64::from(best.0);
         for (q, i) in &self.items[items] {
             let d2 = (q[0] - p[0]).powi(2) + (q[1] - p[1]).powi(2) + (q[2] - p[2]).powi(2);
-            if d2 < best2 || (d2 == best2 && *i < best) {
-                (best, best2) = (*i, d2);
-            }
+            key = key.min(u64::from(d2.to_bits()) << 32 | u64::from(*i));
         }
-        (best, best2)
+        (key as u32, f32::from_bits((key >> 32) as u32))
     }
 
     /// The nearest among the eight cubes around the corner nearest to `p`; false when a nearer one within `within2`

@@ -50,7 +50,7 @@ pub struct TrackCounts {
     pub continued: u64,
     /// Points near enough to continue a trajectory, but of another colour.
     pub unlike: u64,
-    /// Points that could have started a trajectory but for `max_active`.
+    /// Points that could have started a trajectory but for `max_active`; also those too near to others, once it is reached.
     pub no_room: u64,
     /// Points refused: not finite, or absurdly fast.
     pub rejected: u64,
@@ -173,35 +173,37 @@ impl Tracker {
             let opaque = f64::from(p.opacity) >= self.config.min_opacity;
             opaque && p.may_start && p.velocity_map_mps.length() >= self.config.min_speed_mps
         };
-        let candidates: Vec<&TrackPoint> =
-            points.iter().zip(continued).filter(|(p, c)| c.is_none() && fresh(p)).map(|(p, _)| p).collect();
-        if candidates.is_empty() {
-            return;
-        }
-        if self.live.len() >= self.config.max_active {
+        let wanted = points.par_iter().zip(continued).with_min_len(MIN_TRACKS).filter(|(p, c)| c.is_none() && fresh(p));
+        let mut candidates: Vec<&TrackPoint> = wanted.map(|(p, _)| p).collect();
+        if candidates.is_empty() || self.live.len() >= self.config.max_active {
             self.counts.no_room += candidates.len() as u64;
             return;
         }
+        // Stable, so points equally opaque stay in the caller's order.
+        candidates.par_sort_by(|a, b| b.opacity.total_cmp(&a.opacity));
         // In a cube of twice the spacing one sees at least that far, whichever of its corners one is nearest to.
         let spacing_m = self.config.spacing_m;
         let local = |p: DVec3| (p - origin).as_vec3().to_array();
-        let ends =
-            self.live.par_iter().with_min_len(MIN_TRACKS).map(|t| local(t.predicted(stamp_ns))).collect::<Vec<_>>();
+        let ends: Vec<_> =
+            self.live.par_iter().with_min_len(MIN_TRACKS).map(|t| local(t.predicted(stamp_ns))).collect();
         let standing = Grid::new(&ends, 2.0 * spacing_m as f32);
         let limit2 = (spacing_m * spacing_m) as f32;
-        let apart = |p: &&TrackPoint| standing.beside(&local(p.position_map), limit2).0.1 >= limit2;
-        let mut candidates: Vec<&TrackPoint> =
-            candidates.into_par_iter().with_min_len(MIN_TRACKS).filter(apart).collect();
+        let apart = |p: &&&TrackPoint| standing.beside(&local(p.position_map), limit2).0.1 >= limit2;
         let mut taken = Spacing::new(spacing_m, origin, candidates.len());
-        // Stable, so points equally opaque stay in the caller's order.
-        candidates.sort_by(|a, b| b.opacity.total_cmp(&a.opacity));
-        for p in candidates {
-            if self.live.len() >= self.config.max_active {
-                self.counts.no_room += 1;
-            } else if taken.claim(p.position_map) {
-                self.live.push(LiveTrack::new(self.next_id, stamp_ns, p));
-                self.next_id = self.next_id.wrapping_add(1);
-                self.counts.born += 1;
+        // Piece by piece: often there is room for few, and nobody needs to know about the others.
+        for (i, some) in candidates.chunks(MIN_TRACKS).enumerate() {
+            let some: Vec<&&TrackPoint> = some.par_iter().with_min_len(MIN_TRACKS / 8).filter(apart).collect();
+            for (k, p) in some.iter().enumerate() {
+                if taken.claim(p.position_map) {
+                    self.live.push(LiveTrack::new(self.next_id, stamp_ns, p));
+                    self.next_id = self.next_id.wrapping_add(1);
+                    self.counts.born += 1;
+                }
+                if self.live.len() >= self.config.max_active {
+                    let after = candidates.len().saturating_sub((i + 1) * MIN_TRACKS);
+                    self.counts.no_room += (after + some.len() - k - 1) as u64;
+                    return;
+                }
             }
         }
     }

@@ -5,6 +5,8 @@
 //! Two, since points lie much denser than gates are wide: the fine one has cubes that hold a point or two and answers
 //! whoever has a neighbour about as near as points lie to each other; the coarse one answers the rest.
 
+use std::sync::OnceLock;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -20,37 +22,46 @@ const DENSE_POINTS: f32 = 8.0;
 /// A coarse cube's edge is at most so many fine ones.
 const FINEST: f32 = 16.0;
 
-/// A coarse grid, and a fine one where points are dense.
-struct Finder {
-    coarse: Grid,
+/// Points, and how they are found: where they are dense by a fine grid, and by a coarse one where that does not see far
+/// enough.
+struct Finder<'a> {
+    points: &'a [[f32; 3]],
+    cube_m: f32,
     fine: Option<Grid>,
+    /// Made when it is first asked; of dense points it seldom is.
+    coarse: OnceLock<Grid>,
 }
 
-impl Finder {
+impl<'a> Finder<'a> {
+    /// `cube_m` is the coarse cubes' edge.
+    fn new(points: &'a [[f32; 3]], cube_m: f32) -> Self {
+        let crowd = Grid::crowd(points, cube_m);
+        // On a surface the points in a cube grow as its edge squared.
+        let fine_m = cube_m * (FINE_POINTS / crowd).sqrt().max(1.0 / FINEST);
+        let fine = (crowd >= DENSE_POINTS).then(|| Grid::new(points, fine_m));
+        Self { points, cube_m, fine, coarse: OnceLock::new() }
+    }
+
+    fn coarse(&self) -> &Grid {
+        self.coarse.get_or_init(|| Grid::new(self.points, self.cube_m))
+    }
+
+    /// All points with their numbers, those in a cube together.
+    fn in_order(&self) -> &[([f32; 3], u32)] {
+        &self.fine.as_ref().unwrap_or_else(|| self.coarse()).items
+    }
+
     /// The nearest point (of equals the first) whose squared distance is at most `within2`, with that distance.
     fn nearest(&self, p: &[f32; 3], within2: f32) -> Option<(usize, f32)> {
         let found = self.fine.as_ref().map(|fine| fine.beside(p, within2));
         let (at, distance2) = match found {
             Some((best, true)) => best,
             // What lies in the cubes looked at need not be beaten by more than what does not.
-            Some((best, false)) => self.coarse.around(p, best.1),
-            None => self.coarse.around(p, within2),
+            Some((best, false)) => self.coarse().around(p, best.1),
+            None => self.coarse().around(p, within2),
         };
         (at != u32::MAX).then_some((at as usize, distance2))
     }
-}
-
-/// Finders over both sets of points. `cube_m` is the coarse cubes' edge.
-fn finders(from: &[[f32; 3]], to: &[[f32; 3]], cube_m: f32) -> (Finder, Finder) {
-    let (from_coarse, to_coarse) = rayon::join(|| Grid::new(from, cube_m), || Grid::new(to, cube_m));
-    let fine = |points: &[[f32; 3]], coarse: Grid| {
-        let crowd = coarse.crowd();
-        // On a surface the points in a cube grow as its edge squared.
-        let fine_m = cube_m * (FINE_POINTS / crowd).sqrt().max(1.0 / FINEST);
-        let fine = (crowd >= DENSE_POINTS).then(|| Grid::new(points, fine_m));
-        Finder { coarse, fine }
-    };
-    rayon::join(|| fine(from, from_coarse), || fine(to, to_coarse))
 }
 
 /// For every observed place, the predicted one it continues: the nearest one, if it lies within that one's gate and if
@@ -80,9 +91,9 @@ pub(super) fn mutual_nearest(
     // Not so small that a wide gate spans very many cubes.
     let widest_m = gates_m.iter().copied().fold(0.0, f32::max);
     let cube_m = (usual_m as f32).max(widest_m / 8.0).max(1e-3);
-    let (from_finder, to_finder) = finders(&from, &to, cube_m);
+    let (from_finder, to_finder) = rayon::join(|| Finder::new(&from, cube_m), || Finder::new(&to, cube_m));
     // In the order of cubes, so that questions asked one after the other look at the same places.
-    let questions = &from_finder.fine.as_ref().unwrap_or(&from_finder.coarse).items;
+    let questions = from_finder.in_order();
     let answer = |&(ref p, i): &([f32; 3], u32)| {
         let gate_m = gates_m[i as usize];
         let (at, distance2) = to_finder.nearest(p, gate_m * gate_m)?;
