@@ -19,11 +19,17 @@ fn row(y: i32, z: i32) -> u32 {
     mixed ^ (mixed >> 15)
 }
 
-/// The cube's own index along an axis and the place in it, 0 to 1. (`floor` is a call where the processor is not known to
-/// have it.) `as` saturates: what lies too far out shares the outermost cubes.
+/// Cubes along an axis to either side; what lies farther out shares the outermost ones.
+const CUBES: f32 = 4e6;
+/// Floats from here on are whole numbers, the lowest bits of which are the number itself.
+const WHOLE: f32 = 12_582_912.0;
+
+/// The cube's own index along an axis and the place in it, 0 to 1; a place on a face counts for either side. (`floor` and
+/// a checked conversion are calls and branches where the processor is not known to have them; this is a few additions.)
 fn split(scaled: f32) -> (i32, f32) {
-    let index = (scaled as i32).saturating_sub(i32::from((scaled as i32) as f32 > scaled));
-    (index, scaled - index as f32)
+    let scaled = scaled.clamp(-CUBES, CUBES);
+    let whole = (scaled - 0.5) + WHOLE;
+    ((whole.to_bits() as i32).wrapping_sub(WHOLE.to_bits() as i32), scaled - (whole - WHOLE))
 }
 
 /// Distances to faces count as a little less, for what their computation rounds.
@@ -31,6 +37,12 @@ const NEARLY: f32 = 0.999;
 
 /// Nearest so far: number, squared distance. Of equals the first counts.
 pub(super) type Best = (u32, f32);
+
+/// A number that is smaller for what is nearer, of equals for the first: one to compare, and no branch to guess. Bits of
+/// floats that are not negative are ordered as they are, so a distance in front of a number makes a float again.
+fn key((i, distance2): Best) -> f64 {
+    f64::from_bits(u64::from(distance2.to_bits()) << 32 | u64::from(i))
+}
 
 impl Grid {
     /// `cube_m` is the cubes' edge.
@@ -81,13 +93,14 @@ impl Grid {
     #[inline]
     fn look(&self, places: Range<usize>, p: &[f32; 3], best: Best) -> Best {
         let items = self.starts[places.start] as usize..self.starts[places.end] as usize;
-        // Bits of floats that are not negative are ordered as they are: one number to compare, and no branch to guess.
-        let mut key = u64::from(best.1.to_bits()) << 32 | u64::from(best.0);
+        let mut nearest = key(best);
         for (q, i) in &self.items[items] {
             let d2 = (q[0] - p[0]).powi(2) + (q[1] - p[1]).powi(2) + (q[2] - p[2]).powi(2);
-            key = key.min(u64::from(d2.to_bits()) << 32 | u64::from(*i));
+            let this = key((*i, d2));
+            nearest = if this < nearest { this } else { nearest };
         }
-        (key as u32, f32::from_bits((key >> 32) as u32))
+        let bits = nearest.to_bits();
+        (bits as u32, f32::from_bits((bits >> 32) as u32))
     }
 
     /// The nearest among the eight cubes around the corner nearest to `p`; false when a nearer one within `within2`

@@ -18,7 +18,7 @@ const SPEED_SIGMA_MPS: std::ops::RangeInclusive<f64> = 0.2..=4.0;
 const LEARN: f64 = 0.3;
 
 /// Points of a block; a list that moves when it grows would have all trajectories' lists moved every few steps.
-const BLOCK: usize = 8;
+const BLOCK: usize = 16;
 
 /// One trajectory that may still go on.
 #[derive(Debug)]

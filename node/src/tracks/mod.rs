@@ -34,6 +34,9 @@ const MAX_SPEED_MPS: f64 = 200.0;
 /// Trajectories or points one task takes at least: fewer are not worth a thread.
 const MIN_TRACKS: usize = 1024;
 
+/// Ended trajectories one task puts together at least.
+const MIN_ENDED: usize = 32;
+
 /// No point.
 const NONE: u32 = u32::MAX;
 
@@ -215,15 +218,12 @@ impl Tracker {
     }
 
     fn end_where(&mut self, ended: impl Fn(&LiveTrack) -> bool) {
-        let min_points = self.config.min_points;
-        for track in self.live.extract_if(.., |t| ended(t)) {
-            if track.len() >= min_points {
-                self.counts.finished += 1;
-                self.finished.push(track.ended());
-            } else {
-                self.counts.too_short += 1;
-            }
-        }
+        let (all, min_points) = (self.live.len(), self.config.min_points);
+        let mut long: Vec<LiveTrack> = self.live.extract_if(.., |t| ended(t)).collect();
+        long.retain(|t| t.len() >= min_points);
+        self.counts.finished += long.len() as u64;
+        self.counts.too_short += (all - self.live.len() - long.len()) as u64;
+        self.finished.par_extend(long.into_par_iter().with_min_len(MIN_ENDED).map(LiveTrack::ended));
     }
 }
 

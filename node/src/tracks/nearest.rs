@@ -10,7 +10,7 @@ use std::sync::OnceLock;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::grid::Grid;
+use super::grid::{Best, Grid};
 
 /// Questions asked by one task at least: fewer are not worth a thread.
 const MIN_QUESTIONS: usize = 512;
@@ -74,9 +74,8 @@ pub(super) fn mutual_nearest(
     (seen, observed): (usize, impl Fn(usize) -> DVec3 + Sync),
     usual_m: f64,
 ) -> Vec<Option<usize>> {
-    let none = vec![None; seen];
     if count == 0 || seen == 0 {
-        return none;
+        return vec![None; seen];
     }
     // Relative to one of the points, then in f32: a thousandth of a millimetre at 10 m, a tenth at 1 km.
     let origin = observed(0);
@@ -94,21 +93,22 @@ pub(super) fn mutual_nearest(
     let (from_finder, to_finder) = rayon::join(|| Finder::new(&from, cube_m), || Finder::new(&to, cube_m));
     // In the order of cubes, so that questions asked one after the other look at the same places.
     let questions = from_finder.in_order();
-    let answer = |&(ref p, i): &([f32; 3], u32)| {
-        let gate_m = gates_m[i as usize];
-        let (at, distance2) = to_finder.nearest(p, gate_m * gate_m)?;
-        // Of predictions at one and the same place the finder names the first; it gets the observation.
-        let (back, _) = from_finder.nearest(&to[at], distance2)?;
-        (back == i as usize).then_some(at)
-    };
-    let found: Vec<Option<usize>> = questions.par_iter().with_min_len(MIN_QUESTIONS).map(answer).collect();
-    let mut matched = none;
-    for ((_, i), at) in questions.iter().zip(found) {
-        if let Some(slot) = at.and_then(|at| matched.get_mut(at)) {
-            slot.get_or_insert(*i as usize);
+    let answer = |&(ref p, i): &([f32; 3], u32)| to_finder.nearest(p, gates_m[i as usize] * gates_m[i as usize]);
+    let found: Vec<_> = questions.par_iter().with_min_len(MIN_QUESTIONS).map(answer).collect();
+    // Of the predictions that name the same observation only the nearest (of equals the first) can be meant by it.
+    let mut suitors: Vec<Best> = vec![(u32::MAX, f32::INFINITY); seen];
+    for ((_, i), answer) in questions.iter().zip(found) {
+        let Some((at, distance2)) = answer else { continue };
+        let suitor = &mut suitors[at];
+        if (distance2, *i) < (suitor.1, suitor.0) {
+            *suitor = (*i, distance2);
         }
     }
-    matched
+    let meant = |(&(i, distance2), p): (&Best, &[f32; 3])| {
+        let (back, _) = (i != u32::MAX).then(|| from_finder.nearest(p, distance2))??;
+        (back == i as usize).then_some(back)
+    };
+    suitors.par_iter().zip(&to).with_min_len(MIN_QUESTIONS).map(meant).collect()
 }
 
 #[cfg(test)]

@@ -165,7 +165,7 @@ fn a_lead_vehicle_that_never_leaves_takes_no_more_memory() {
     for step in 0..5000i64 {
         let time = step as f64 * 0.1;
         t.step(step * 100 * MS, 0, &[point(v * time, v)]);
-        assert!(t.bytes() < 100_000);
+        assert!(t.bytes() < 100_000 && t.live()[0].born_ns() == 0);
         rows.extend(t.drain().into_iter().flat_map(|t| t.points.into_iter().map(move |p| (t.id, p.stamp_ns))));
     }
     rows.extend(t.finish().into_iter().flat_map(|t| t.points.into_iter().map(move |p| (t.id, p.stamp_ns))));
@@ -187,6 +187,7 @@ fn rate() {
             .collect();
         let (start, cpu_start) = (std::time::Instant::now(), crate::pipeline::timing::cpu_ms().unwrap_or(0.0));
         t.step(step * 100 * MS, 0, &points);
+        let _ended = t.drain();
         if step >= 10 {
             wall.push(start.elapsed().as_secs_f64() * 1e3);
             cpu.push(crate::pipeline::timing::cpu_ms().unwrap_or(0.0) - cpu_start);
