@@ -149,12 +149,17 @@ impl Skipper {
     pub fn plan(&mut self, window: &Window<Frame>, demand: Demand) -> Plan {
         let compute = Plan::Compute { shadow: None };
         let Some(last) = self.last.as_ref().filter(|last| last.demand.covers(demand)) else { return compute };
-        if self.config.still && same(&self.config, &last.window, window).is_ok() {
-            return match self.still.decide() {
-                Verdict::Skip => Plan::Reuse(last.clone()),
-                Verdict::Check => Plan::Compute { shadow: Some(Shadow::of(last)) },
-                Verdict::Full => compute,
-            };
+        if self.config.still {
+            match same(&self.config, &last.window, window) {
+                Err(why) => debug!("the step at {} ns shows something new: {why:?}", window.stamp_ns),
+                Ok(()) => {
+                    return match self.still.decide() {
+                        Verdict::Skip => Plan::Reuse(last.clone()),
+                        Verdict::Check => Plan::Compute { shadow: Some(Shadow::of(last)) },
+                        Verdict::Full => compute,
+                    };
+                }
+            }
         }
         if !self.config.predict || last.views.is_empty() || !in_reach(&self.config, &last.window, window) {
             return compute;
