@@ -6,8 +6,8 @@ use super::track::{Track, TrackPoint, TrackSample};
 use crate::config::TracksConfig;
 use crate::sync::clock::seconds_between;
 
-/// A trajectory's points are handed out in pieces of at most this many, so that memory stays bounded behind a lead
-/// vehicle that never leaves: a minute at 10 Hz.
+/// A trajectory's points are handed out in pieces of this many and a block or two more, so that memory stays bounded
+/// behind a lead vehicle that never leaves: a minute at 10 Hz.
 pub(super) const PIECE_POINTS: usize = 600;
 
 /// What a new trajectory's speed may be off by, m/s.
@@ -107,8 +107,8 @@ impl LiveTrack {
 
     /// All points but the last as a piece of their own, once there are enough.
     pub(super) fn cut(&mut self) -> Option<Track> {
-        // No block holds more than `BLOCK`, so this is looked at often and done seldom.
-        if self.older.len() < PIECE_POINTS / BLOCK {
+        // The oldest block may hold a single point, all others are full.
+        if self.older.len() < PIECE_POINTS.div_ceil(BLOCK) + 1 {
             return None;
         }
         let mut piece = self.take();

@@ -166,7 +166,9 @@ fn a_lead_vehicle_that_never_leaves_takes_no_more_memory() {
         let time = step as f64 * 0.1;
         t.step(step * 100 * MS, 0, &[point(v * time, v)]);
         assert!(t.bytes() < 100_000 && t.live()[0].born_ns() == 0);
-        rows.extend(t.drain().into_iter().flat_map(|t| t.points.into_iter().map(move |p| (t.id, p.stamp_ns))));
+        let pieces = t.drain();
+        assert!(pieces.iter().all(|p| p.points.len() >= live::PIECE_POINTS));
+        rows.extend(pieces.into_iter().flat_map(|t| t.points.into_iter().map(move |p| (t.id, p.stamp_ns))));
     }
     rows.extend(t.finish().into_iter().flat_map(|t| t.points.into_iter().map(move |p| (t.id, p.stamp_ns))));
     assert_eq!((rows.len(), t.counts().finished), (5000, 1));
