@@ -1,11 +1,11 @@
-//! Keeping new trajectories apart from all others.
+//! Keeping new trajectories apart from each other; from those alive they are kept by a grid, all at once.
 
 use glam::DVec3;
 
 /// No further place.
 const END: u32 = u32::MAX;
 
-/// A set of places, at least `spacing_m` apart as far as they were added through [`Spacing::claim`].
+/// A set of places at least `spacing_m` apart.
 pub(super) struct Spacing {
     inverse_m: f64,
     limit2: f64,
@@ -37,7 +37,7 @@ impl Spacing {
     }
 
     /// Adds a place, near others or not.
-    pub fn add(&mut self, p: DVec3) {
+    fn add(&mut self, p: DVec3) {
         let (at, hash) = (self.places.len() as u32, self.hash(self.cube(p)));
         self.places.push((p, std::mem::replace(&mut self.newest[hash], at)));
     }
