@@ -29,7 +29,7 @@ use crate::plain;
 pub(crate) use arrange::{gaussians, patches, unnest};
 pub use chain::{Step, chain};
 pub use precision::Precision;
-pub use process::{keep_freed_memory, set_up_training};
+pub use process::{give_back_freed_memory, keep_freed_memory, set_up_training, share_one_heap};
 
 /// A linear layer: weight `(out, in)` as PyTorch stores it, optional bias `(out)`.
 ///

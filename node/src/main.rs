@@ -6,6 +6,7 @@ use clap::Parser;
 use storm_node::cmd::{Cli, Outcome};
 
 fn main() -> ExitCode {
+    storm_model::ops::share_one_heap();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {

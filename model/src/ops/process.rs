@@ -1,4 +1,4 @@
-//! What a process that trains asks of candle's threads and of the C library's allocator.
+//! What a process asks of the C library's allocator, and one that trains of candle's threads.
 
 /// Environment variable with the number of threads of candle's own pool.
 const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
@@ -31,6 +31,22 @@ pub fn keep_freed_memory() {
     glibc::keep_freed_memory();
 }
 
+/// With glibc, all threads take their memory from one heap; elsewhere this does nothing. Call it before there are threads.
+///
+/// By default each thread has a heap of its own. What one thread allocates and another frees (scenes, pictures and map cells do
+/// that at every step) leaves holes in each of them, and over an hour's drive the process grows by a few per cent while what it
+/// holds stays the same. Kernels do not allocate in their loops, so threads seldom wait for the one heap.
+pub fn share_one_heap() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    glibc::share_one_heap();
+}
+
+/// With glibc, hands memory that was freed back to the system: about 2 ms for 64 MiB. Elsewhere this does nothing.
+pub fn give_back_freed_memory() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    glibc::give_back_freed_memory();
+}
+
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 mod glibc {
     use std::ffi::c_int;
@@ -39,11 +55,14 @@ mod glibc {
     const M_TRIM_THRESHOLD: c_int = -1;
     /// `malloc.h`: blocks of this many bytes and more are mapped and unmapped one by one.
     const M_MMAP_THRESHOLD: c_int = -3;
+    /// `malloc.h`: heaps at most.
+    const M_ARENA_MAX: c_int = -8;
     /// The largest the library takes on 64-bit machines.
     const LARGEST_MMAP_THRESHOLD: c_int = 32 << 20;
 
     unsafe extern "C" {
         fn mallopt(parameter: c_int, value: c_int) -> c_int;
+        fn malloc_trim(kept_at_the_top: usize) -> c_int;
     }
 
     /// A refused value leaves the allocator as it was.
@@ -52,6 +71,21 @@ mod glibc {
         unsafe {
             mallopt(M_MMAP_THRESHOLD, LARGEST_MMAP_THRESHOLD);
             mallopt(M_TRIM_THRESHOLD, c_int::MAX);
+        }
+    }
+
+    /// As [`keep_freed_memory`]; heaps that threads have already stay theirs.
+    pub fn share_one_heap() {
+        // SAFETY: as above.
+        unsafe {
+            mallopt(M_ARENA_MAX, 1);
+        }
+    }
+
+    pub fn give_back_freed_memory() {
+        // SAFETY: takes the allocator's own locks, and touches only pages that hold nothing.
+        unsafe {
+            malloc_trim(0);
         }
     }
 }

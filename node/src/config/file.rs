@@ -55,7 +55,7 @@ pub(crate) fn nests_too_deep(text: &[u8]) -> bool {
     })
 }
 
-fn check_depth(path: &str, text: &str) -> Result<(), ConfigError> {
+pub(super) fn check_depth(path: &str, text: &str) -> Result<(), ConfigError> {
     let message = || format!("brackets nest deeper than {MAX_DEPTH}");
     match nests_too_deep(text.as_bytes()) {
         true => Err(ConfigError::Parse { path: path.into(), message: message() }),
@@ -153,6 +153,18 @@ mod tests {
         for bad in ["window.stride=0.4", "window.stride_sec", "window.stride_sec=fast", "window.timesteps=-1"] {
             assert!(Config::default().with_override(bad).is_err(), "{bad}");
         }
+    }
+
+    /// Two names of brackets, one closed before the other begins in the order of the text but not in that of the keys: found
+    /// by fuzzing.
+    #[test]
+    fn what_is_read_can_be_written_and_read() {
+        let (open, close) = ("[".repeat(100), "]".repeat(100));
+        let text = |closed: &str| format!("model: {{weights: '{open}'}}\ninput: {{base_frame: '{closed}{open}'}}\n");
+        let read = Config::from_yaml(&text("")).unwrap_err().to_string();
+        assert!(read.contains("brackets"), "{read}");
+        let written = Config::from_yaml(&text(&close)).unwrap_err().to_string();
+        assert!(written.contains("brackets"), "{written}");
     }
 
     /// Aliases of aliases, ten at a time, and brackets without end: small texts that would be large values.

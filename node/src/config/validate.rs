@@ -3,6 +3,7 @@
 use storm_model::Precision;
 use storm_model::network::{MAX_KV_POOL, MAX_MERGE};
 
+use super::file::check_depth;
 use super::{Config, ConfigError};
 
 impl Config {
@@ -106,7 +107,9 @@ impl Config {
         let cameras = self.input.images.len();
         same_length("input.camera_infos", self.input.camera_infos.len(), cameras)?;
         same_length("input.base_from_camera", self.input.base_from_camera.len(), cameras)?;
-        same_length("input.image_time_offset_sec", self.input.image_time_offset_sec.len(), cameras)
+        same_length("input.image_time_offset_sec", self.input.image_time_offset_sec.len(), cameras)?;
+        // Names may hold brackets, and are written in another order than they were read in: what is accepted can be read again.
+        check_depth("the configuration as it would be written", &self.to_yaml())
     }
 }
 

@@ -8,8 +8,11 @@ use super::RgbPicture;
 use super::error::DecodeError;
 use super::rows::MAX_SIDE;
 use crate::msg::CompressedImage;
+use crate::pipeline::guard::caught;
 
-/// Memory a decoder may take: a 100-megapixel picture with its working buffers.
+/// Largest picture: a few hundred bytes can claim more, and take seconds to unpack.
+const MAX_PIXELS: usize = 100_000_000;
+/// Memory a decoder may take: the largest picture with its working buffers.
 const MAX_DECODER_BYTES: u64 = 1 << 30;
 
 /// A compressed picture as 8-bit RGB; grey becomes RGB, an alpha channel is dropped, 16-bit samples keep their upper part.
@@ -40,21 +43,28 @@ pub fn compressed_of_size(
         _ if message.data.is_empty() => return Err(wrong("it is empty".to_owned())),
         _ => return Err(wrong("neither JPEG nor PNG; only these are accepted".to_owned())),
     };
-    if let Some((want_width, want_height)) = expected {
-        let header = ImageReader::with_format(Cursor::new(&message.data), format);
-        let (width, height) = header.into_dimensions().map_err(|e| wrong(e.to_string()))?;
-        let (width, height) = (width as usize, height as usize);
-        if (width, height) != (want_width, want_height) {
-            return Err(DecodeError::Size { width, height, want_width, want_height });
-        }
+    let reader = || ImageReader::with_format(Cursor::new(&message.data), format);
+    // A decoder of others that panics on a hostile file says no more than that the file is damaged.
+    let gave_up = |what: String| wrong(format!("the decoder gave up on it: {what}"));
+    let header = caught(|| reader().into_dimensions()).map_err(gave_up)?;
+    let (width, height) = header.map(|(w, h)| (w as usize, h as usize)).map_err(|e| wrong(e.to_string()))?;
+    if let Some((want_width, want_height)) = expected.filter(|want| *want != (width, height)) {
+        return Err(DecodeError::Size { width, height, want_width, want_height });
+    }
+    if width.saturating_mul(height) > MAX_PIXELS {
+        return Err(wrong(format!("it claims {width} x {height} pixels; at most {MAX_PIXELS} are accepted")));
     }
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE);
     limits.max_image_height = Some(MAX_SIDE);
     limits.max_alloc = Some(MAX_DECODER_BYTES);
-    let mut reader = ImageReader::with_format(Cursor::new(&message.data), format);
-    reader.limits(limits);
-    let picture = reader.decode().map_err(|e| wrong(e.to_string()))?;
+    let decoded = caught(|| {
+        let mut reader = reader();
+        reader.limits(limits);
+        reader.decode()
+    });
+    let decoded = decoded.map_err(gave_up)?;
+    let picture = decoded.map_err(|e| wrong(e.to_string()))?;
     let rgb = match picture {
         DynamicImage::ImageRgb8(rgb) => rgb,
         other => other.into_rgb8(),
@@ -97,7 +107,7 @@ mod tests {
         let crc = crc32fast::hash(&png.data[12..29]).to_be_bytes();
         png.data[29..33].copy_from_slice(&crc);
         let e = compressed_to_rgb(&png).unwrap_err().to_string();
-        assert!(e.to_lowercase().contains("limit"), "{e}");
+        assert!(e.to_lowercase().contains("limit") || e.contains("at most"), "{e}");
 
         let mut jpeg = encode(RgbImage::new(64, 64), ImageFormat::Jpeg);
         let sof = jpeg.data.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
@@ -109,6 +119,8 @@ mod tests {
         large.data[16..24].copy_from_slice(&[0, 0, 0x40, 0, 0, 0, 0x30, 0]);
         let crc = crc32fast::hash(&large.data[12..29]).to_be_bytes();
         large.data[29..33].copy_from_slice(&crc);
+        let e = compressed_to_rgb(&large).unwrap_err().to_string();
+        assert!(e.contains("16384 x 12288") && e.contains("at most 100000000"), "{e}");
         let e = compressed_of_size(&large, Some((4, 4))).unwrap_err();
         assert!(matches!(e, DecodeError::Size { width: 16384, height: 12288, want_width: 4, want_height: 4 }), "{e}");
         let whole = encode(RgbImage::new(4, 4), ImageFormat::Jpeg);

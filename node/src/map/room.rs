@@ -4,6 +4,7 @@
 use std::collections::HashSet;
 
 use glam::DVec3;
+use storm_model::ops::give_back_freed_memory;
 
 use super::format::is_sound;
 use super::fuse::Jobs;
@@ -20,16 +21,10 @@ const SPILLED_TO: f64 = 0.875;
 /// Windows between two attempts at a disk that refused.
 const RETRY_WINDOWS: u64 = 50;
 
-/// Hands memory that was freed back to the system. Tiles of all sizes come and go among what stays, and glibc keeps what
-/// they leave unless it is told: over a drive that spills, resident memory would go on growing though nothing more is in
-/// use.
-fn give_back() {
-    #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    // SAFETY: takes the allocator's own locks, and touches only pages that hold nothing.
-    unsafe {
-        libc::malloc_trim(0);
-    }
-}
+/// Windows between two times that a map that has been at its caps gives freed memory back. Tiles of all sizes come and go among
+/// what stays, and glibc keeps what they leave unless it is told: over a drive that spills, resident memory would go on growing
+/// though nothing more is in use.
+const GIVE_BACK_WINDOWS: u64 = 100;
 
 impl StaticMap {
     /// Brings the map within its caps.
@@ -37,6 +32,10 @@ impl StaticMap {
         let (gaussians, bytes) = (self.loaded(), self.bytes());
         let (most, most_bytes) = (self.config.max_gaussians, self.config.max_mb.saturating_mul(1 << 20));
         if gaussians <= most && bytes <= most_bytes {
+            let full_before = self.counts.spilled + self.counts.evicted > 0;
+            if full_before && self.revision.is_multiple_of(GIVE_BACK_WINDOWS) {
+                give_back_freed_memory();
+            }
             return;
         }
         if self.config.spill && self.store.is_some() && self.revision >= self.retry_spill_at {
@@ -44,7 +43,7 @@ impl StaticMap {
             let before = counts.spilled;
             self.spill(gaussians.saturating_sub(part(most)), bytes.saturating_sub(part(most_bytes)), counts);
             if counts.spilled > before {
-                give_back();
+                give_back_freed_memory();
             }
         }
         // Tiles shrink only once a good part of them is gone: a few rounds may be needed to free bytes.

@@ -39,13 +39,13 @@ impl Memory {
 
 /// Megabytes in use and kept unused.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
-fn allocator_mb() -> (f64, f64) {
+pub(super) fn allocator_mb() -> (f64, f64) {
     // SAFETY: takes no arguments, and only reads the allocator's own counters under its locks.
     let info = unsafe { libc::mallinfo2() };
     ((info.uordblks + info.hblkhd) as f64 / 1e6, info.fordblks as f64 / 1e6)
 }
 
 #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
-fn allocator_mb() -> (f64, f64) {
+pub(super) fn allocator_mb() -> (f64, f64) {
     (0.0, 0.0)
 }

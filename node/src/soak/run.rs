@@ -20,7 +20,7 @@ use crate::pipeline::timing::{cpu_ms, rss_mb};
 use crate::tracks::{TrackCounts, Tracker};
 
 use super::map_quality::{MapFigures, MapJudge, ever_moving};
-use super::memory::Memory;
+use super::memory::{Memory, allocator_mb};
 use super::motion_quality::{MotionFigures, MotionJudge};
 use super::object_quality::{ObjectFigures, ObjectJudge};
 use super::oracle::{OracleErrors, OracleSet, OracleStep, OracleWindow};
@@ -69,6 +69,10 @@ pub struct Quarter {
     pub rss_mb: [f64; 2],
     /// Map Gaussians in memory, and those on disk alone, at its end.
     pub map_gaussians: [usize; 2],
+    /// Mean of what the map's tiles hold, MB: it comes and goes between the cap and what a spill leaves.
+    pub tiles_mb: f64,
+    /// Mean of what was asked of the allocator and not given back, MB.
+    pub allocated_mb: f64,
     /// Where memory is at its end.
     pub memory_mb: Memory,
 }
@@ -165,6 +169,8 @@ struct Times {
     track: [f64; 2],
     objects: [f64; 2],
     rss_mb: f64,
+    tiles_mb: f64,
+    allocated_mb: f64,
     map: [usize; 2],
 }
 
@@ -198,6 +204,8 @@ fn quarter(times: &[Times], memory_mb: Memory) -> Quarter {
         step_ms: spread(times, |t| [0, 1].map(|k| t.fuse[k] + t.overlap[k] + t.track[k])),
         rss_mb: [times.iter().map(|t| t.rss_mb).sum::<f64>() / n, times.iter().map(|t| t.rss_mb).fold(0.0, f64::max)],
         map_gaussians: times.last().map_or([0; 2], |t| t.map),
+        tiles_mb: times.iter().map(|t| t.tiles_mb).sum::<f64>() / n,
+        allocated_mb: times.iter().map(|t| t.allocated_mb).sum::<f64>() / n,
         memory_mb,
     }
 }
@@ -299,6 +307,8 @@ pub fn run(options: &SoakOptions, progress: &dyn Fn(usize)) -> Result<SoakReport
             track,
             objects: object_ms,
             rss_mb,
+            tiles_mb: map.bytes() as f64 / 1e6,
+            allocated_mb: allocator_mb().0,
             map: [loaded, map.len() - loaded],
         });
         if 4 * times.len() >= (memory.len() + 1) * all_steps {

@@ -170,7 +170,10 @@ pub fn bag() -> Vec<Vec<u8>> {
 /// Files of both kinds, and rows of every encoding.
 pub fn image() -> Vec<Vec<u8>> {
     let file = |format| [vec![1], compressed(format)].concat();
-    let mut all = vec![file(ImageFormat::Jpeg), file(ImageFormat::Png)];
+    // Found by fuzzing: sums of brightness that overflow in the JPEG decoder, and 801 bytes that claim 314 megapixels.
+    let overflow = include_bytes!("../found/image_dc_overflow").to_vec();
+    let large = include_bytes!("../found/image_many_pixels").to_vec();
+    let mut all = vec![file(ImageFormat::Jpeg), file(ImageFormat::Png), overflow, large];
     for i in 0..ENCODINGS.len() {
         // 4 x 3 pixels of up to 12 bytes, no padding.
         let head = [(i as u8) << 1, 4, 0, 3, 0, 0, 0, 0];

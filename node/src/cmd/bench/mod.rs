@@ -4,6 +4,7 @@
 mod drives;
 mod flops;
 mod network;
+mod pairs;
 mod peers;
 mod report;
 mod settings;
@@ -12,6 +13,7 @@ mod sizes;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use indicatif::ProgressBar;
 use serde_json::json;
 
 use super::{Outcome, UsageError, progress_bar};
@@ -22,7 +24,7 @@ use crate::engine::evaluate::{Clip, Method};
 use crate::output::atomic::write_bytes;
 
 pub(super) use network::time_network;
-use network::{Data, References};
+use network::{Data, References, Subject};
 use report::{Baseline, DriveSetting, Report};
 use settings::Named;
 
@@ -146,20 +148,26 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         };
         let data = Data::held_out(&base, clips, bag)?;
         let mut references = References::new();
-        for row in network_rows.iter().filter(|row| row.large || model != LARGEST) {
+        for (nth, row) in network_rows.iter().filter(|row| row.large || model != LARGEST).enumerate() {
+            // The peer before and after the first row of its size, so that a slow while of the machine is in both.
+            let peer = args.peer_python.as_ref().filter(|_| nth == 0 && model == LARGEST);
+            time_peer(peer, &mut report, &bar)?;
             bar.set_message(format!("{model}, {}", row.name));
             let config = row.config(model)?;
-            let s = network::measure(model, &row.name, &row.set, &config, &data, &mut references, args.runs)?;
+            let beside = (config != base).then_some(&base);
+            let subject = Subject { model, name: &row.name, set: &row.set, config: &config, beside };
+            let s = network::measure(&subject, &data, &mut references, args.runs)?;
             let text = |x: Option<f64>| x.map_or("-".to_string(), |x| format!("{x:.3}"));
             bar.suspend(|| {
                 say!(
-                    "{:6} {:36} {:>6} tokens {:>8.1} GFLOP: step p50 {:>8.1} ms, p99 {:>8.1} ms, network {:>8.1} ms, three views {:>6.1} ms, peak {:.0} MB; against {}: PSNR {} dB, EPE3D {} m/s",
+                    "{:6} {:36} {:>6} tokens {:>8.1} GFLOP: step p50 {:>8.1} ms, p99 {:>8.1} ms, {}network {:>8.1} ms, three views {:>6.1} ms, peak {:.0} MB; against {}: PSNR {} dB, EPE3D {} m/s",
                     s.model,
                     s.setting,
                     s.tokens,
                     s.gflop,
                     s.step_ms.p50,
                     s.step_ms.p99,
+                    s.times_less.map_or(String::new(), |less| format!("{less:.2} times less, ")),
                     s.stages_ms["network"].p50,
                     s.stages_ms["render"].p50,
                     s.peak_rss_mb.unwrap_or(0.0),
@@ -170,6 +178,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             });
             report.settings.push(s);
             bar.inc(1);
+            time_peer(peer, &mut report, &bar)?;
         }
         if trained {
             bar.set_message("other methods");
@@ -197,26 +206,37 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         bar.set_message(format!("cost against {curve}"));
         let p = sizes::measure(curve, size)?;
         bar.suspend(|| {
-            say!("{curve}: {:>6} tokens {:>9.2} GFLOP {:>9.1} ms", p.tokens, p.gflop, p.network_ms);
+            say!(
+                "{curve}: {:>6} tokens {:>9.2} GFLOP {:>9.1} ms, {:.2} times the usual size's",
+                p.tokens,
+                p.gflop,
+                p.network_ms,
+                p.times_usual
+            );
         });
         report.sizes.push(p);
         bar.inc(1);
     }
-    if let Some(python) = &args.peer_python {
-        bar.set_message("PyTorch");
-        report.peer_pytorch = Some(peers::time_peer(python)?);
-    }
+    let peer = args.peer_python.as_ref().filter(|_| report.peer_pytorch.is_none());
+    time_peer(peer, &mut report, &bar)?;
     bar.finish_and_clear();
     if let Some(peer) = &report.peer_pytorch {
         let seconds = peer["median_s"].as_f64().unwrap_or(f64::NAN);
         say!("PyTorch f32 at B/8's size: {seconds:.1} s");
-        if let Some(b8) = report.settings.iter().find(|s| s.model == LARGEST) {
-            let ours = b8.stages_ms["network"].p50 / 1e3;
-            say!("ours {ours:.1} s; ratio {:.2}", ours / seconds);
+        if let Some(ratio) = report.peer_times_less() {
+            say!("ours {:.1} s: {ratio:.2} of it", ratio * seconds);
         }
     }
     write(args, &report)?;
     Ok(Outcome::Done)
+}
+
+fn time_peer(python: Option<&PathBuf>, report: &mut Report, bar: &ProgressBar) -> Result<()> {
+    if let Some(python) = python {
+        bar.set_message("PyTorch");
+        report.peer_pytorch = Some(peers::time_peer(python, report.peer_pytorch.as_ref())?);
+    }
+    Ok(())
 }
 
 fn write(args: &Args, report: &Report) -> Result<()> {

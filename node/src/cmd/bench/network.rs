@@ -8,10 +8,11 @@ use anyhow::{Context, Result};
 use serde::Serialize;
 use storm_model::metrics::Mean;
 use storm_model::metrics::mask::iou;
+use storm_model::ops::give_back_freed_memory;
 use storm_model::scene::{RenderedView, Scene, Want};
-use storm_render::Intrinsics;
 
 use super::flops::{WindowSize, count};
+use super::pairs::{Pairs, Turns};
 use crate::config::{Config, ModelConfigSection, WindowConfig};
 use crate::engine::evaluate::{Clip, Placed, Prediction, Tally};
 use crate::engine::figures::Figures;
@@ -24,8 +25,12 @@ use crate::window::WindowBuilder;
 
 /// Drive whose pictures are used where no clips are given.
 const SEED: u64 = 424_242;
-/// From this width on a step takes minutes of processor time: one run, no warm-up.
+/// From this width on a step takes a minute of processor time: few runs, no warm-up.
 const LARGE: usize = 768;
+/// Runs of those.
+const RUNS_OF_LARGE: usize = 2;
+/// Short steps are run for this long, up to so many times.
+const SHORT: (f64, usize) = (4.0, 25);
 
 /// What errors are measured against.
 pub(super) const TRUTH: &str = "truth";
@@ -48,6 +53,8 @@ pub(in crate::cmd) struct Setting {
     pub picture: [usize; 2],
     pub clips: usize,
     pub step_ms: StageStats,
+    /// How many times longer the default's step takes, run in turn with this one's: the median over the turns.
+    pub times_less: Option<f64>,
     pub stages_ms: BTreeMap<String, StageStats>,
     pub peak_rss_mb: Option<f64>,
     /// What the figures are measured against.
@@ -84,92 +91,130 @@ fn engine(config: &Config, cameras: usize) -> Result<Engine> {
     Ok(Engine::new(source, &config.model, cameras, config.window.timespan_sec)?.with_skips(&config.skip))
 }
 
+/// A setting's engine and the windows it is run on.
+struct Runs {
+    engine: Engine,
+    clips: Vec<Clip>,
+}
+
+impl Runs {
+    /// Of an engine that has run already, but for the largest networks.
+    fn new(config: &Config, data: &Data) -> Result<Self> {
+        let clips = data.clips.iter().map(|c| shortened(c, &config.window)).collect::<Result<Vec<_>>>()?;
+        let cameras = clips.first().context("no clip to measure on")?.cameras.len();
+        let mut runs = Self { engine: engine(config, cameras)?, clips };
+        if !runs.large() {
+            runs.step(0, &mut Timings::default())?;
+        }
+        Ok(runs)
+    }
+
+    fn large(&self) -> bool {
+        self.engine.model_config().embed_dim >= LARGE
+    }
+
+    /// The network and the newest timestep's views, each timed.
+    fn step(&mut self, nth: usize, timings: &mut Timings) -> Result<(Scene, Vec<RenderedView>, f64)> {
+        let clip = &self.clips[nth % self.clips.len()];
+        let (start, window) = (Instant::now(), &clip.window);
+        let scene = timings.time("network", || self.engine.step(window, &clip.cameras))?;
+        let targets = views_of(&window.steps[window.steps.len() - 1], &window.map_from_anchor, &clip.cameras);
+        let want = Want { flow: true, motion: true };
+        let views = timings.time("render", || self.engine.render(&scene, &targets, newest_time_sec(window), want))?;
+        let ms = start.elapsed().as_secs_f64() * 1e3;
+        timings.add("step", ms);
+        Ok((scene, views, ms))
+    }
+}
+
+/// What is measured: a network with these keys of its configuration changed.
+pub(super) struct Subject<'a> {
+    pub model: &'a str,
+    /// The row's name.
+    pub name: &'a str,
+    /// `KEY=VALUE`.
+    pub set: &'a [String],
+    pub config: &'a Config,
+    /// The setting that is run in turn with it.
+    pub beside: Option<&'a Config>,
+}
+
 /// Measures a setting: at least `runs` timed steps, every clip scored. `references` grow at the first, most exact setting of a
 /// network without weights.
-pub(super) fn measure(
-    model: &str,
-    name: &str,
-    set: &[String],
-    config: &Config,
-    data: &Data,
-    references: &mut References,
-    runs: usize,
-) -> Result<Setting> {
-    let clips = data.clips.iter().map(|c| shortened(c, &config.window)).collect::<Result<Vec<_>>>()?;
-    let first = clips.first().context("no clip to measure on")?;
+pub(super) fn measure(subject: &Subject, data: &Data, references: &mut References, runs: usize) -> Result<Setting> {
+    let config = subject.config;
+    // What earlier rows held is not this one's.
+    give_back_freed_memory();
     reset_peak_rss();
-    let mut engine = engine(config, first.cameras.len())?;
-    let network = engine.model_config().clone();
-    let large = network.embed_dim >= LARGE;
-    let untrained = engine.weights() == UNTRAINED;
-    let warm = usize::from(!large);
-    let runs = if large { clips.len() } else { runs.max(clips.len()) };
+    let mut own = Runs::new(config, data)?;
+    let large = own.large();
+    let mut peak = (!large).then(peak_rss_mb).flatten();
+    let mut beside: Option<Runs> = None;
+    let untrained = own.engine.weights() == UNTRAINED;
     let (mut timings, mut tally, mut gaps) = (Timings::default(), Tally::default(), Gaps::default());
     let mut gaussians = 0;
-    for run in 0..warm + runs {
-        let (nth, clip) = (run.saturating_sub(warm), &clips[run.saturating_sub(warm) % clips.len()]);
-        let mut once = Timings::default();
-        let (scene, views) = step(&mut engine, clip, &mut once)?;
-        if run < warm {
-            continue;
-        }
-        timings.merge(once);
+
+    let clips = own.clips.len();
+    let mut one = |turn: usize| -> Result<f64> {
+        let (scene, views, ms) = own.step(turn, &mut timings)?;
+        peak = peak.or_else(peak_rss_mb);
         gaussians = scene.gaussians.len();
-        if nth >= clips.len() {
-            continue;
-        }
-        if untrained {
-            match references.get(nth) {
+        if turn < clips && untrained {
+            match references.get(turn) {
                 Some(exact) => gaps.add(exact, &views)?,
                 None => references.push(views),
             }
-        } else {
+        } else if turn < clips {
+            let clip = &own.clips[turn];
             let whole = scene.shape.timesteps == clip.window.steps.len();
             tally.add(clip, &Prediction::Scenes(vec![Placed::in_window(clip, scene, whole)]), None)?;
         }
-    }
-    let peak_rss_mb = peak_rss_mb();
-    let weights = engine.weights().to_string();
-    let shortcuts = engine.shortcuts().clone();
-    drop(engine);
+        Ok(ms)
+    };
+    let mut other = |turn: usize| -> Result<f64> {
+        let beside = match &mut beside {
+            Some(runs) => runs,
+            // Made only now: the peak is of the setting alone.
+            none => none.insert(Runs::new(subject.beside.unwrap_or(config), data)?),
+        };
+        Ok(beside.step(turn, &mut Timings::default())?.2)
+    };
+    let turns = if large {
+        Turns { least: clips.max(RUNS_OF_LARGE), most: clips.max(RUNS_OF_LARGE), seconds: 0.0 }
+    } else {
+        let least = runs.max(clips);
+        Turns { least, most: least.max(SHORT.1), seconds: SHORT.0 }
+    };
+    let pairs = Pairs::take(turns, &mut one, subject.beside.is_some().then_some(&mut other as _))?;
+    let Runs { engine, clips } = own;
+    let cameras = &clips.first().context("no clip to measure on")?.cameras;
     let size = WindowSize {
         timesteps: config.window.timesteps,
-        cameras: first.cameras.len(),
-        width: first.cameras[0].width,
-        height: first.cameras[0].height,
+        cameras: cameras.len(),
+        width: cameras[0].width,
+        height: cameras[0].height,
     };
-    let work = count(&network, size, &shortcuts);
+    let work = count(engine.model_config(), size, engine.shortcuts());
     let stages_ms = timings.stats();
     Ok(Setting {
-        model: model.into(),
-        weights,
-        setting: name.into(),
+        model: subject.model.into(),
+        weights: engine.weights().to_string(),
+        setting: subject.name.into(),
         dtype: config.model.precision.clone(),
-        skips: set.to_vec(),
+        skips: subject.set.to_vec(),
         tokens: work.tokens,
         gflop: work.flops * 1e-9,
         gaussians,
         picture: [size.width, size.height],
         clips: clips.len(),
         step_ms: stages_ms["step"].clone(),
+        times_less: pairs.times_less(),
         stages_ms,
-        peak_rss_mb,
+        peak_rss_mb: peak,
         against: if untrained { EXACT } else { TRUTH },
         figures: if untrained { gaps.figures() } else { tally.figures() },
         bag_psnr: if untrained { None } else { bag_psnr(config, &data.bag)? },
     })
-}
-
-/// The network and the newest timestep's views, each timed.
-fn step(engine: &mut Engine, clip: &Clip, timings: &mut Timings) -> Result<(Scene, Vec<RenderedView>)> {
-    let start = Instant::now();
-    let window = &clip.window;
-    let scene = timings.time("network", || engine.step(window, &clip.cameras))?;
-    let targets = views_of(&window.steps[window.steps.len() - 1], &window.map_from_anchor, &clip.cameras);
-    let want = Want { flow: true, motion: true };
-    let views = timings.time("render", || engine.render(&scene, &targets, newest_time_sec(window), want))?;
-    timings.add("step", start.elapsed().as_secs_f64() * 1e3);
-    Ok((scene, views))
 }
 
 /// The clip with the configured number of timesteps, the newest ones; its other frames are held out.
@@ -258,24 +303,6 @@ pub(in crate::cmd) fn time_network(name: &str, section: &ModelConfigSection, run
     let config = Config { model: section.clone(), ..Config::default() };
     let size = ModelSource::open(section)?.picture_size(section)?;
     let data = Data { clips: vec![Clip::of_seed(SEED, size)?], bag: Vec::new() };
-    measure(name, "default", &[], &config, &data, &mut References::new(), runs)
-}
-
-/// Milliseconds of one pass of a network on any window, and the pass's count of work: the median of a few runs, fewer where one
-/// takes seconds.
-pub(super) fn time_pass(engine: &mut Engine, clip: &Clip, cameras: &[Intrinsics], seconds: f64) -> Result<f64> {
-    let start = Instant::now();
-    let mut ms = Vec::new();
-    loop {
-        let one = Instant::now();
-        engine.step(&clip.window, cameras)?;
-        ms.push(one.elapsed().as_secs_f64() * 1e3);
-        if ms.len() >= 7 || (ms.len() >= 2 && start.elapsed().as_secs_f64() > seconds) || ms[0] > 1e3 * seconds {
-            break;
-        }
-    }
-    // The first one warms up, where there are others.
-    let mut timed = if ms.len() > 1 { ms.split_off(1) } else { ms };
-    timed.sort_by(f64::total_cmp);
-    Ok(timed[(timed.len() - 1) / 2])
+    let subject = Subject { model: name, name: "default", set: &[], config: &config, beside: None };
+    measure(&subject, &data, &mut References::new(), runs)
 }

@@ -10,6 +10,7 @@ use serde_json::json;
 use storm_render::world::{Drive, DriveOptions};
 
 use super::network::Data;
+use super::pairs::median;
 use crate::config::Config;
 use crate::engine::evaluate::{Effort, Evaluation, Method};
 use crate::engine::figures::Figures;
@@ -54,19 +55,26 @@ pub(super) fn time_world() -> Result<(f64, serde_json::Value)> {
     Ok((fps, json!({"images_per_sec": fps, "picture": [240, 160], "images": WORLD_IMAGES})))
 }
 
-/// The same shapes in PyTorch at B/8's size.
-pub(super) fn time_peer(python: &Path) -> Result<serde_json::Value> {
+/// Runs of the peer each time it is called, the first of them cold.
+const PEER_RUNS: &str = "2";
+
+/// The same shapes in PyTorch at B/8's size: two more runs to those `before`.
+pub(super) fn time_peer(python: &Path, before: Option<&serde_json::Value>) -> Result<serde_json::Value> {
     let script = "tests/python/peer_network.py";
     let output = Command::new(python)
-        .arg(script)
+        .args([script, "--runs", PEER_RUNS])
         .output()
         .with_context(|| format!("cannot run {} {script} (from the project's root)", python.display()))?;
     let text = String::from_utf8_lossy(&output.stdout);
     let mut peer: serde_json::Value = serde_json::from_str(text.trim()).with_context(|| {
         format!("the peer failed: {}", String::from_utf8_lossy(&output.stderr).lines().last().unwrap_or("no output"))
     })?;
-    let mut seconds: Vec<f64> = peer["seconds"].as_array().into_iter().flatten().filter_map(|x| x.as_f64()).collect();
-    seconds.sort_by(f64::total_cmp);
-    peer["median_s"] = json!(seconds.get(seconds.len() / 2));
+    let runs = |peer: &serde_json::Value| -> Vec<f64> {
+        peer["seconds"].as_array().into_iter().flatten().filter_map(serde_json::Value::as_f64).collect()
+    };
+    let mut seconds = before.map_or_else(Vec::new, runs);
+    seconds.extend(runs(&peer));
+    peer["seconds"] = json!(seconds);
+    peer["median_s"] = json!(median(seconds));
     Ok(peer)
 }

@@ -94,7 +94,9 @@ impl Report {
 
     fn settings_table(&self) -> String {
         let mut text = String::from(
-            "## Settings\n\nFull steps: the network, then the newest pictures drawn with flow and motion groups. Networks with weights are \
+            "## Settings\n\nFull steps: the network, then the newest pictures drawn with flow and motion groups. `times less`: each \
+             setting's steps are run in turn with the default's, and this is the median of how many times longer those take: it \
+             repeats where the times, which the machine's slow whiles lengthen, do not. Networks with weights are \
              scored on held-out drives against the truth by `storm eval`'s protocol (more timesteps left out: more pictures held \
              out); those without against their own exact f32 result. FLOPs are counted, not measured.\n\n",
         );
@@ -102,6 +104,7 @@ impl Report {
             "network, setting",
             "step p50, ms",
             "p99",
+            "times less",
             "network p50",
             "p99",
             "drawing p50",
@@ -121,6 +124,7 @@ impl Report {
                 format!("{}, {}", s.model, s.setting),
                 stage("step", |t| t.p50),
                 stage("step", |t| t.p99),
+                cell(s.times_less, 2),
                 stage("network", |t| t.p50),
                 stage("network", |t| t.p99),
                 stage("render", |t| t.p50),
@@ -135,13 +139,20 @@ impl Report {
         }
         if let Some(peer) = &self.peer_pytorch {
             let ms = peer["median_s"].as_f64().map(|s| 1e3 * s);
-            let mut cells = vec!["PyTorch, B/8's shapes, f32, eager".to_string(), cell(ms, 1), "-".into(), cell(ms, 1)];
+            let mut cells = vec!["PyTorch, B/8's shapes, f32, eager".to_string(), cell(ms, 1), "-".into()];
+            cells.extend([cell(self.peer_times_less(), 2), cell(ms, 1)]);
             cells.extend(["-", "-", "-", "7220", "-"].map(String::from));
             cells.push(cell(peer["peak_rss_mb"].as_f64(), 0));
             cells.extend(["-"; 8].map(String::from));
             text += &row(&cells);
         }
         text + "\n"
+    }
+
+    /// How many times longer the largest network's default takes than the peer.
+    pub fn peer_times_less(&self) -> Option<f64> {
+        let largest = self.settings.iter().find(|s| s.model == super::LARGEST && s.times_less.is_none())?;
+        Some(largest.stages_ms.get("network")?.p50 / 1e3 / self.peer_pytorch.as_ref()?["median_s"].as_f64()?)
     }
 
     fn baselines_table(&self) -> String {
@@ -229,8 +240,8 @@ impl Report {
             return String::new();
         }
         let mut text = String::from(
-            "## Cost against size\n\nThe network alone, of `tiny`'s width and without weights, in f32; the last column is the counted work \
-             at the rate of the curve's largest window.\n\n",
+            "## Cost against size\n\nThe network alone, of `tiny`'s width and without weights, in f32. `times the usual`: beside passes of \
+             4 timesteps of 3 cameras at 96x64, run in turn. The last column is the counted work at the rate of the curve's largest window.\n\n",
         ) + &head(&[
             "curve",
             "timesteps",
@@ -239,6 +250,7 @@ impl Report {
             "tokens",
             "GFLOP",
             "measured, ms",
+            "times the usual",
             "counted, ms",
         ]);
         for p in &self.sizes {
@@ -251,6 +263,7 @@ impl Report {
                 p.tokens.to_string(),
                 format!("{:.2}", p.gflop),
                 format!("{:.1}", p.network_ms),
+                format!("{:.2}", p.times_usual),
                 format!("{:.1}", p.gflop / rate(&curve)),
             ]);
         }
@@ -335,6 +348,7 @@ mod tests {
             picture: [96, 64],
             clips: 1,
             step_ms: stats.clone(),
+            times_less: (name != "default").then_some(1.5),
             stages_ms: [("step".to_string(), stats)].into(),
             peak_rss_mb: Some(100.0),
             against: super::super::network::TRUTH,
@@ -353,6 +367,7 @@ mod tests {
             tokens,
             gflop,
             network_ms,
+            times_usual: network_ms / 100.0,
         };
         let report = Report {
             settings: vec![setting("default", 100.0, 22.5), setting("int8", 60.0, 22.4)],
@@ -366,7 +381,7 @@ mod tests {
             let widths: Vec<usize> = table.lines().map(|l| l.matches('|').count()).collect();
             assert!(widths.iter().all(|w| *w == widths[0]), "{table}");
         }
-        assert!(text.contains("| 12.0 | 10.0 |"), "counted at the largest one's rate: {text}");
+        assert!(text.contains("| 12.0 | 0.12 | 10.0 |"), "counted at the largest one's rate: {text}");
         let svg = report.picture();
         assert!(svg.contains("tiny, int8") && svg.contains("counted FLOPs") && !svg.contains("NaN"), "{svg}");
         assert!(svg.contains("font-weight=\"bold\">1 tiny, default"), "the default is marked: {svg}");

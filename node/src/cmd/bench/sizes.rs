@@ -1,12 +1,14 @@
 //! Cost against size: tokens, cameras and timesteps, measured beside the counted operations.
 
+use std::time::Instant;
+
 use anyhow::{Context, Result};
 use serde::Serialize;
 use storm_model::Shortcuts;
 use storm_render::world::{Drive, DriveOptions};
 
 use super::flops::{WindowSize, count};
-use super::network::time_pass;
+use super::pairs::{Pairs, Turns, median};
 use crate::config::Config;
 use crate::engine::evaluate::Clip;
 use crate::engine::{Engine, ModelSource};
@@ -14,8 +16,10 @@ use crate::source::world::posed_set;
 use crate::window::WindowBuilder;
 
 const SEED: u64 = 424_242;
-/// Time spent on one point before no further run of it is begun, seconds.
-const POINT_SEC: f64 = 6.0;
+/// Runs of one point, each beside one of the usual size; where they take long, fewer.
+const TURNS: Turns = Turns { least: 3, most: 15, seconds: 4.0 };
+/// The usual size.
+const USUAL: WindowSize = WindowSize { timesteps: 4, cameras: 3, width: 96, height: 64 };
 
 /// One point of a curve.
 #[derive(Debug, Clone, Serialize)]
@@ -28,6 +32,8 @@ pub(super) struct Point {
     pub tokens: usize,
     pub gflop: f64,
     pub network_ms: f64,
+    /// How many times as long as the usual size's, run in turn.
+    pub times_usual: f64,
 }
 
 /// Picture sizes of 3 cameras x 4 timesteps: 404 to 10,388 tokens with patches of 8 pixels.
@@ -47,17 +53,39 @@ pub(super) fn plan(largest: bool) -> Vec<(&'static str, WindowSize)> {
     all
 }
 
-/// Times an untrained network of `tiny`'s width.
+/// An untrained network of `tiny`'s width and a window of some size.
+struct Pass {
+    engine: Engine,
+    clip: Clip,
+}
+
+impl Pass {
+    /// Of a network that has run already.
+    fn new(size: WindowSize) -> Result<Self> {
+        let mut config = Config::default();
+        config.model.weights = crate::engine::UNTRAINED.into();
+        (config.model.image_width, config.model.image_height) = (size.width, size.height);
+        config.window.timesteps = size.timesteps;
+        let clip = clip(&config, size)?;
+        let source = ModelSource::open(&config.model)?;
+        let engine = Engine::new(source, &config.model, size.cameras, config.window.timespan_sec)?;
+        let mut pass = Self { engine, clip };
+        pass.ms()?;
+        Ok(pass)
+    }
+
+    fn ms(&mut self) -> Result<f64> {
+        let start = Instant::now();
+        self.engine.step(&self.clip.window, &self.clip.cameras)?;
+        Ok(start.elapsed().as_secs_f64() * 1e3)
+    }
+}
+
+/// Times one point.
 pub(super) fn measure(curve: &'static str, size: WindowSize) -> Result<Point> {
-    let mut config = Config::default();
-    config.model.weights = crate::engine::UNTRAINED.into();
-    (config.model.image_width, config.model.image_height) = (size.width, size.height);
-    config.window.timesteps = size.timesteps;
-    let clip = clip(&config, size)?;
-    let source = ModelSource::open(&config.model)?;
-    let mut engine = Engine::new(source, &config.model, size.cameras, config.window.timespan_sec)?;
-    let work = count(engine.model_config(), size, &Shortcuts::default());
-    let network_ms = time_pass(&mut engine, &clip, &clip.cameras, POINT_SEC)?;
+    let (mut pass, mut usual) = (Pass::new(size)?, Pass::new(USUAL)?);
+    let work = count(pass.engine.model_config(), size, &Shortcuts::default());
+    let pairs = Pairs::take(TURNS, &mut |_| pass.ms(), Some(&mut |_| usual.ms()))?;
     Ok(Point {
         curve,
         timesteps: size.timesteps,
@@ -65,7 +93,8 @@ pub(super) fn measure(curve: &'static str, size: WindowSize) -> Result<Point> {
         picture: [size.width, size.height],
         tokens: work.tokens,
         gflop: work.flops * 1e-9,
-        network_ms,
+        times_usual: pairs.times_less().map_or(f64::NAN, |less| 1.0 / less),
+        network_ms: median(pairs.one).unwrap_or(f64::NAN),
     })
 }
 
@@ -117,5 +146,6 @@ mod tests {
         let p = measure("tokens", size).unwrap();
         assert_eq!((p.tokens, p.cameras), (16 + 20, 1));
         assert!(p.network_ms > 0.0 && p.gflop > 0.0);
+        assert!((0.0..1.0).contains(&p.times_usual), "{}", p.times_usual);
     }
 }
