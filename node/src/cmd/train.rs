@@ -4,6 +4,7 @@ mod bags;
 mod curves;
 mod cuts;
 mod grid;
+mod mean;
 mod recipe;
 mod recordings;
 mod variants;
@@ -51,9 +52,10 @@ pub struct Args {
     /// Architecture of a new network.
     #[arg(long, default_value = "tiny", conflicts_with_all = ["weights", "resume"])]
     preset: String,
-    /// Start from these weights, or from the ones that ship (`shipped`), with a fresh optimiser.
-    #[arg(long, conflicts_with = "resume")]
-    weights: Option<PathBuf>,
+    /// Start from these weights, or from the ones that ship (`shipped`), with a fresh optimiser. Several, comma-separated: from their
+    /// mean (with --minutes 0 it is only written).
+    #[arg(long, conflicts_with = "resume", value_delimiter = ',')]
+    weights: Vec<PathBuf>,
     /// Go on exactly where this checkpoint was written; its options hold, only --out, --minutes and the reports differ.
     #[arg(long)]
     resume: Option<PathBuf>,
@@ -207,13 +209,12 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
     if let Some(path) = &args.resume {
         return Ok(Trainer::resume(path, device)?);
     }
-    let Beginning { config, weights, history } = match &args.weights {
-        Some(path) => args.variant.change(trained(path)?, args.seed)?,
-        None => {
-            let config = ModelConfig::preset(&args.preset).map_err(|e| UsageError(e.to_string()))?;
-            let config = ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config };
-            args.variant.make(&config, args.seed, &args.preset)?
-        }
+    let Beginning { config, weights, history } = if args.weights.is_empty() {
+        let config = ModelConfig::preset(&args.preset).map_err(|e| UsageError(e.to_string()))?;
+        let config = ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config };
+        args.variant.make(&config, args.seed, &args.preset)?
+    } else {
+        args.variant.change(mean::mean(&args.weights, &trained)?, args.seed)?
     };
     let mut options = TrainOptions::new(args.seed, args.steps, args.batch, PAPER_RATE);
     options.history = history;
@@ -223,10 +224,10 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         height: config.image_height,
         ..ClipOptions::default()
     };
-    let from = match (args.recorded.alone(), &args.weights) {
+    let from = match (args.recorded.alone(), args.weights.is_empty()) {
         (true, _) => Start::Recordings,
-        (false, Some(_)) => Start::Weights,
-        (false, None) => Start::New,
+        (false, false) => Start::Weights,
+        (false, true) => Start::New,
     };
     args.recipe.apply(&mut options, from)?;
     if let Some(x) = args.flow_weight {
@@ -269,7 +270,10 @@ fn trained(path: &std::path::Path) -> Result<Beginning> {
 fn save(args: &Args, trainer: &Trainer) -> Result<()> {
     trainer.save_checkpoint(&args.out.join("last.ckpt"))?;
     let dtype = if args.f16 { SavedType::F16 } else { SavedType::F32 };
-    let provenance = format!("{}, {} steps done", trainer.options().describe(), trainer.steps_done());
+    let provenance = match trainer.steps_done() {
+        0 => trainer.options().history.clone(),
+        steps => format!("{}, {steps} steps done", trainer.options().describe()),
+    };
     let path = args.out.join("weights.safetensors");
     save_safetensors(&path, trainer.config(), &trainer.weights(true)?, dtype, &provenance)?;
     Ok(())

@@ -34,10 +34,11 @@ fn columns(name: GridName) -> Vec<Column> {
 
 /// What was trained, in one line.
 fn what(args: &Args) -> String {
-    let from = args
-        .weights
-        .as_ref()
-        .map_or_else(|| format!("new {} networks", args.preset), |w| format!("from {} weights", w.display()));
+    let weights: Vec<String> = args.weights.iter().map(|w| w.display().to_string()).collect();
+    let from = match weights.is_empty() {
+        true => format!("new {} networks", args.preset),
+        false => format!("from {} weights", weights.join(" and ")),
+    };
     format!(
         "{from}, {} steps of {} clips, {} cameras, recipe {}, data seed {}; {} validation drives",
         args.steps,
