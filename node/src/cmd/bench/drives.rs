@@ -9,6 +9,7 @@ use anyhow::{Context, Result};
 use serde::Serialize;
 use storm_render::world::{Drive, DriveOptions};
 
+use super::pairs::median;
 use crate::config::Config;
 use crate::decode::RgbPicture;
 use crate::dice::Dice;
@@ -162,11 +163,6 @@ impl Sums {
     fn row(&self, drive: &'static str) -> DriveRow {
         let (full_ms, ms) = (self.ms[0] / self.full_steps.max(1) as f64, self.ms[1] / self.steps.max(1) as f64);
         let [still, predicted, approximate] = [0, 1, 2].map(|n| self.notches[n].len());
-        let median = |n: usize| {
-            let mut ms = self.notches[n].clone();
-            ms.sort_by(f64::total_cmp);
-            ms.get(ms.len() / 2).copied()
-        };
         let figures = |t: &Tally| (t.images() > 0).then(|| t.figures());
         let [full, skipping] = [figures(&self.tallies[0]), figures(&self.tallies[1])];
         DriveRow {
@@ -178,8 +174,8 @@ impl Sums {
             full_ms,
             ms,
             ratio: full_ms / ms,
-            still_ms: median(0),
-            predicted_ms: median(1),
+            still_ms: median(self.notches[0].clone()),
+            predicted_ms: median(self.notches[1].clone()),
             full,
             skipping,
         }
