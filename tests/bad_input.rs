@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use common::{code, metrics, replay, shared, stderr, storm};
 use maker::{FRAMES, Maker, stamp};
 
-/// Steps an unspoiled bag gives: a window at every frame from 15 on, and one at 14 by the window's tolerance.
+/// Steps an unspoiled bag gives: a window ends at every frame but the first 15.
 const STEPS: u64 = (FRAMES - 15) as u64;
 
 struct Run {

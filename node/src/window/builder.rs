@@ -34,12 +34,6 @@ fn hop_ns(hop_sec: f64) -> u64 {
     unsigned_ns(hop_sec * (1.0 - HOP_TOLERANCE))
 }
 
-#[derive(Debug)]
-pub(super) struct Kept<T> {
-    pub(super) set: Arc<PosedSet<T>>,
-    in_window: bool,
-}
-
 /// Builds windows from posed sets as they come.
 #[derive(Debug)]
 pub struct WindowBuilder<T> {
@@ -48,7 +42,7 @@ pub struct WindowBuilder<T> {
     tolerance_ns: u64,
     hop_ns: u64,
     reference_camera: usize,
-    pub(super) history: VecDeque<Kept<T>>,
+    pub(super) history: VecDeque<Arc<PosedSet<T>>>,
     epoch: Option<u32>,
     first_ns: i64,
     cameras: usize,
@@ -84,18 +78,19 @@ impl<T> WindowBuilder<T> {
         if self.keep(set) { self.newest() } else { None }
     }
 
-    /// The window that ends at the newest set, if there is one. Sets kept before without a window of their own are new in
-    /// it where it holds them.
+    /// The window that ends at the newest set, if there is one.
     pub fn newest(&mut self) -> Option<Window<T>> {
-        let newest_ns = self.history.back()?.set.stamp_ns;
+        let newest_ns = self.history.back()?.stamp_ns;
         if self.last_step_ns.is_some_and(|last_ns| newest_ns.abs_diff(last_ns) < self.hop_ns) {
             self.counts.hop += 1;
             return None;
         }
+        if self.filling(newest_ns) {
+            self.counts.filling += 1;
+            return None;
+        }
         let Some(picks) = self.pick(newest_ns) else {
-            let oldest_place_ns = self.place_ns(newest_ns, self.timesteps - 1);
-            let filling = i128::from(self.first_ns) > i128::from(oldest_place_ns) + i128::from(self.tolerance_ns);
-            *(if filling { &mut self.counts.filling } else { &mut self.counts.gap }) += 1;
+            self.counts.gap += 1;
             return None;
         };
         self.counts.windows += 1;
@@ -112,9 +107,9 @@ impl<T> WindowBuilder<T> {
         self.reference_camera = reference_camera;
         match kept {
             Some(kept) => {
-                for k in &mut self.history {
-                    let frames = kept.iter().filter_map(|&c| k.set.frames.get(c).cloned()).collect();
-                    k.set = Arc::new(PosedSet { frames, ..*k.set });
+                for set in &mut self.history {
+                    let frames = kept.iter().filter_map(|&c| set.frames.get(c).cloned()).collect();
+                    *set = Arc::new(PosedSet { frames, ..**set });
                 }
                 self.cameras = kept.len();
             }
@@ -156,7 +151,7 @@ impl<T> WindowBuilder<T> {
             self.epoch = Some(set.epoch);
             self.first_ns = set.stamp_ns;
             self.cameras = set.frames.len();
-        } else if self.history.back().is_some_and(|k| set.stamp_ns <= k.set.stamp_ns) {
+        } else if self.history.back().is_some_and(|newest| set.stamp_ns <= newest.stamp_ns) {
             self.counts.out_of_order += 1;
             return false;
         } else if !(finite && set.frames.len() == self.cameras) {
@@ -164,9 +159,9 @@ impl<T> WindowBuilder<T> {
             return false;
         }
         let oldest_ns = self.place_ns(set.stamp_ns, self.timesteps - 1);
-        self.history.push_back(Kept { set: Arc::new(set), in_window: false });
+        self.history.push_back(Arc::new(set));
         let too_old = |stamp_ns: i64| stamp_ns < oldest_ns && stamp_ns.abs_diff(oldest_ns) > self.tolerance_ns;
-        while self.history.front().is_some_and(|k| too_old(k.set.stamp_ns)) {
+        while self.history.front().is_some_and(|oldest| too_old(oldest.stamp_ns)) {
             self.history.pop_front();
         }
         true
@@ -177,15 +172,23 @@ impl<T> WindowBuilder<T> {
         newest_ns.saturating_sub(self.stride_ns.saturating_mul(i64::try_from(k).unwrap_or(i64::MAX)))
     }
 
+    /// Whether the oldest timestep's place lies before the epoch's first set: by more than the tolerance, or by so much that the
+    /// next set, which comes at once, will have a place nearer to it. Uneven timesteps are no way to begin.
+    fn filling(&self, newest_ns: i64) -> bool {
+        let next = self.history.get(1).map(|second| second.stamp_ns.abs_diff(self.first_ns) / 2);
+        let most_ns = next.map_or(self.tolerance_ns, |half_ns| half_ns.min(self.tolerance_ns));
+        i128::from(self.first_ns) > i128::from(self.place_ns(newest_ns, self.timesteps - 1)) + i128::from(most_ns)
+    }
+
     /// History indices of the window's timesteps, oldest first.
     fn pick(&self, newest_ns: i64) -> Option<Vec<usize>> {
         let mut picks = vec![self.history.len().checked_sub(1)?];
         for k in 1..self.timesteps {
             let place_ns = self.place_ns(newest_ns, k);
-            let distance = |i: usize| self.history[i].set.stamp_ns.abs_diff(place_ns);
+            let distance = |i: usize| self.history[i].stamp_ns.abs_diff(place_ns);
             // Only sets older than the timestep before can be meant, so the timesteps are distinct and in order.
             let older = *picks.last()?;
-            let after = self.history.partition_point(|kept| kept.set.stamp_ns < place_ns).min(older);
+            let after = self.history.partition_point(|set| set.stamp_ns < place_ns).min(older);
             let candidates = after.checked_sub(1).into_iter().chain((after < older).then_some(after));
             let nearest = candidates.min_by_key(|&i| distance(i)).filter(|&i| distance(i) <= self.tolerance_ns)?;
             picks.push(nearest);
@@ -194,16 +197,12 @@ impl<T> WindowBuilder<T> {
         Some(picks)
     }
 
-    fn window(&mut self, picks: &[usize]) -> Option<Window<T>> {
-        let new_steps = picks.iter().rev().take_while(|&&i| !self.history[i].in_window).count();
-        for &i in picks {
-            self.history[i].in_window = true;
-        }
-        let steps: Vec<_> = picks.iter().map(|&i| Arc::clone(&self.history[i].set)).collect();
+    fn window(&self, picks: &[usize]) -> Option<Window<T>> {
+        let steps: Vec<_> = picks.iter().map(|&i| Arc::clone(&self.history[i])).collect();
         let (first, newest) = (steps.first()?, steps.last()?);
         let map_from_anchor = first.frames.get(self.reference_camera)?.map_from_camera * camera_from_flu();
         let since_first = |stamp_ns| seconds_between(first.stamp_ns, stamp_ns);
         let time_sec = steps.iter().map(|s| s.frames.iter().map(|f| since_first(f.stamp_ns)).collect()).collect();
-        Some(Window { epoch: newest.epoch, stamp_ns: newest.stamp_ns, map_from_anchor, time_sec, new_steps, steps })
+        Some(Window { epoch: newest.epoch, stamp_ns: newest.stamp_ns, map_from_anchor, time_sec, steps })
     }
 }

@@ -49,8 +49,6 @@ pub struct Window<T> {
     pub steps: Vec<Arc<PosedSet<T>>>,
     /// Per timestep and camera, seconds since the oldest timestep's reference stamp.
     pub time_sec: Vec<Vec<f64>>,
-    /// How many of the newest timesteps were in no earlier window.
-    pub new_steps: usize,
 }
 
 impl<T> Window<T> {

@@ -37,8 +37,6 @@ fn at_10_hz_windows_interleave_and_nothing_is_wasted() {
     let index = |w: &Window<i64>| stamps(w).iter().map(|s| (s - 1000 * SEC) / 103_600_000).collect::<Vec<_>>();
     assert_eq!(index(&windows[0]), [0, 4, 9, 14]);
     assert_eq!(index(&windows[36]), [36, 40, 45, 50]);
-    assert_eq!(windows[0].new_steps, 4);
-    assert!(windows[6..].iter().all(|w| w.new_steps == 1));
     assert!((windows[0].time_sec[3][0] - 1.4504).abs() < 1e-9 && windows[0].time_sec[0][0] == 0.0);
     assert!(b.history() <= 16, "{}", b.history());
 }
@@ -48,9 +46,11 @@ fn hop_skips_sets_but_keeps_them_for_later_windows() {
     let config = WindowConfig { hop_sec: 0.5, ..Default::default() };
     let mut b = WindowBuilder::new(&config, 0);
     let windows: Vec<_> = (0..51).filter_map(|i| b.push(plain(i * 100 * MS + (i % 2) * MS))).collect();
-    assert_eq!(windows.iter().map(|w| w.stamp_ns / (100 * MS)).collect::<Vec<_>>(), [14, 19, 24, 29, 34, 39, 44, 49]);
-    assert_eq!(windows.iter().map(|w| w.new_steps).collect::<Vec<_>>(), [4, 1, 1, 1, 1, 1, 1, 1]);
-    assert_eq!(b.counts().hop, 29);
+    assert_eq!(windows.iter().map(|w| w.stamp_ns / (100 * MS)).collect::<Vec<_>>(), [15, 20, 25, 30, 35, 40, 45, 50]);
+    assert!(
+        windows.iter().all(|w| w.time_sec.iter().zip([0.0, 0.5, 1.0, 1.5]).all(|(t, at)| (t[0] - at).abs() < 2e-3))
+    );
+    assert_eq!(b.counts().hop, 28);
 }
 
 #[test]
@@ -58,7 +58,7 @@ fn one_timestep_is_a_window_at_every_set() {
     let mut b = WindowBuilder::new(&WindowConfig { timesteps: 1, ..Default::default() }, 0);
     for i in 0..5 {
         let w = b.push(plain(i * 700 * MS)).unwrap();
-        assert_eq!((w.steps.len(), w.new_steps, b.history()), (1, 1, 1));
+        assert_eq!((w.steps.len(), b.history()), (1, 1));
     }
 }
 
@@ -68,7 +68,7 @@ fn a_gap_costs_the_windows_that_need_it_only() {
     let windows = (0..100).filter(|i| !(40..44).contains(i)).filter_map(|i| b.push(plain(i * 100 * MS))).count();
     // Without sets 40 to 43 the places at 41.5 +- 0.25 have none: each of the three older timesteps meets it once or
     // twice.
-    assert_eq!((b.counts().filling, windows + b.counts().gap as usize), (14, 82));
+    assert_eq!((b.counts().filling, windows + b.counts().gap as usize), (15, 81));
     assert!((3..=6).contains(&b.counts().gap), "{:?}", b.counts());
 }
 
@@ -79,7 +79,7 @@ fn a_new_epoch_starts_anew_and_old_or_odd_sets_are_refused() {
         b.push(set(i * 100 * MS, 3, DVec3::ZERO));
     }
     assert!(b.push(set(0, 4, DVec3::ZERO)).is_none());
-    assert_eq!((b.history(), b.counts().filling), (1, 14 + 1));
+    assert_eq!((b.history(), b.counts().filling), (1, 15 + 1));
     assert!(b.push(set(2100 * MS, 3, DVec3::ZERO)).is_none());
     assert!(b.push(set(0, 4, DVec3::ZERO)).is_none());
     assert_eq!(b.counts().out_of_order, 2);
@@ -88,7 +88,7 @@ fn a_new_epoch_starts_anew_and_old_or_odd_sets_are_refused() {
     assert_eq!((b.counts().malformed, b.history()), (2, 1));
     assert!(WindowBuilder::new(&WindowConfig::default(), 1).push(plain(0)).is_none());
     let windows: Vec<_> = (1..16).filter_map(|i| b.push(set(i * 100 * MS, 4, DVec3::ZERO))).collect();
-    assert_eq!(windows.iter().map(|w| (w.epoch, w.new_steps)).collect::<Vec<_>>(), [(4, 4), (4, 3)]);
+    assert_eq!(windows.iter().map(|w| (w.epoch, stamps(w)[0])).collect::<Vec<_>>(), [(4, 0)]);
 }
 
 #[test]
@@ -126,7 +126,10 @@ proptest! {
             let window = b.push(plain(t));
             let places: Vec<i64> = (0..timesteps).map(|k| t - k as i64 * (stride_sec * 1e9).round() as i64).collect();
             let near = |place: i64| all.iter().map(|s| s.abs_diff(place)).min().unwrap_or(u64::MAX);
-            let possible = places.iter().all(|&p| near(p) <= (stride_sec * stride_tolerance * 1e9).round() as u64);
+            let most = (stride_sec * stride_tolerance * 1e9).round() as u64;
+            // An epoch's first window waits for the set that has its oldest timestep nearest to the first set.
+            let waits = all.get(1).map_or(most, |second| (second.abs_diff(all[0]) / 2).min(most));
+            let possible = places.iter().all(|&p| near(p) <= most) && places[timesteps - 1] + waits as i64 >= all[0];
             prop_assert_eq!(window.is_some(), possible);
             if let Some(w) = window {
                 let picked = stamps(&w);
@@ -134,9 +137,9 @@ proptest! {
                 for (s, &p) in picked.iter().rev().zip(&places) {
                     prop_assert_eq!(s.abs_diff(p), near(p));
                 }
-                prop_assert!(w.new_steps >= 1 && w.time_sec.len() == timesteps);
+                prop_assert!(w.time_sec.len() == timesteps);
             }
-            let span = b.history.back().unwrap().set.stamp_ns.abs_diff(b.history.front().unwrap().set.stamp_ns);
+            let span = b.history.back().unwrap().stamp_ns.abs_diff(b.history.front().unwrap().stamp_ns);
             prop_assert!(span as f64 * 1e-9 <= stride_sec * (timesteps as f64 - 1.0 + stride_tolerance) + 1e-6);
         }
         let c = b.counts();
@@ -184,7 +187,7 @@ fn stages_fit_together_over_a_looped_recording() {
         }
     }
     assert_eq!((sets, sync.drops().total(), gate.drops().total()), (100, 0, 0));
-    assert_eq!(windows.iter().filter(|w| w.epoch == 0).count(), 36);
-    assert_eq!(windows.iter().filter(|w| w.epoch == 1).count(), 36);
+    assert_eq!(windows.iter().filter(|w| w.epoch == 0).count(), 35);
+    assert_eq!(windows.iter().filter(|w| w.epoch == 1).count(), 35);
     assert_eq!((epoch, poses.counts().clock_jumps), (1, 1));
 }
