@@ -30,7 +30,7 @@ const LARGE: usize = 768;
 /// Runs of those.
 const RUNS_OF_LARGE: usize = 2;
 /// Short steps are run for this long, up to so many times.
-const SHORT: (f64, usize) = (4.0, 25);
+const SHORT: (f64, usize) = (24.0, 25);
 
 /// What errors are measured against.
 pub(super) const TRUTH: &str = "truth";
@@ -53,8 +53,10 @@ pub(in crate::cmd) struct Setting {
     pub picture: [usize; 2],
     pub clips: usize,
     pub step_ms: StageStats,
-    /// How many times longer the default's step takes, run in turn with this one's: the median over the turns.
+    /// How many times longer the default's step takes, run in turn with this one's, by the lower quartiles.
     pub times_less: Option<f64>,
+    /// Those turns: this setting's steps and the default's.
+    pub turns_ms: Pairs,
     pub stages_ms: BTreeMap<String, StageStats>,
     pub peak_rss_mb: Option<f64>,
     /// What the figures are measured against.
@@ -209,6 +211,7 @@ pub(super) fn measure(subject: &Subject, data: &Data, references: &mut Reference
         clips: clips.len(),
         step_ms: stages_ms["step"].clone(),
         times_less: pairs.times_less(),
+        turns_ms: pairs,
         stages_ms,
         peak_rss_mb: peak,
         against: if untrained { EXACT } else { TRUTH },

@@ -95,8 +95,8 @@ impl Report {
     fn settings_table(&self) -> String {
         let mut text = String::from(
             "## Settings\n\nFull steps: the network, then the newest pictures drawn with flow and motion groups. `times less`: each \
-             setting's steps are run in turn with the default's, and this is the median of how many times longer those take: it \
-             repeats where the times, which the machine's slow whiles lengthen, do not. Networks with weights are \
+             setting's steps are run in turn with the default's, and this is how many times longer those take by the lower \
+             quartiles: it repeats where the times, which whatever else the machine does lengthens, do not. Networks with weights are \
              scored on held-out drives against the truth by `storm eval`'s protocol (more timesteps left out: more pictures held \
              out); those without against their own exact f32 result. FLOPs are counted, not measured.\n\n",
         );
@@ -331,6 +331,7 @@ impl Report {
 
 #[cfg(test)]
 mod tests {
+    use super::super::pairs::Pairs;
     use super::*;
     use crate::pipeline::timing::StageStats;
 
@@ -349,6 +350,7 @@ mod tests {
             clips: 1,
             step_ms: stats.clone(),
             times_less: (name != "default").then_some(1.5),
+            turns_ms: Pairs::default(),
             stages_ms: [("step".to_string(), stats)].into(),
             peak_rss_mb: Some(100.0),
             against: super::super::network::TRUTH,
@@ -368,6 +370,7 @@ mod tests {
             gflop,
             network_ms,
             times_usual: network_ms / 100.0,
+            turns_ms: Pairs::default(),
         };
         let report = Report {
             settings: vec![setting("default", 100.0, 22.5), setting("int8", 60.0, 22.4)],
