@@ -5,7 +5,7 @@
 #[path = "fuzz/src/seeds.rs"]
 #[allow(missing_docs)]
 mod seeds;
-#[path = "fuzz/src/targets.rs"]
+#[path = "fuzz/src/targets/mod.rs"]
 mod targets;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};

@@ -217,7 +217,6 @@ mod tests {
             stamp_ns: steps.last().unwrap().stamp_ns,
             map_from_anchor: Rigid::new(glam::DQuat::IDENTITY, glam::DVec3::ZERO),
             time_sec: vec![vec![0.0]; steps.len()],
-            new_steps: 1,
             steps,
         }
     }

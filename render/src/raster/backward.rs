@@ -4,9 +4,10 @@
 //! -> `unproject` (each Gaussian adds its pairs in a fixed order and passes them on) -> [`SplatGradients`]. Every row has
 //! one writer, so the result is the same for any number of threads.
 
+use super::grid::{TILE_H, TILE_W};
 use super::project::Camera;
 use super::tile::{FeatureRows, TileInput};
-use super::tiles::{ChunkView, TILE_H, TILE_W};
+use super::tiles::ChunkView;
 use super::unblend::{MOMENTS, UnblendScratch, UpstreamRow, unblend_tile};
 use super::unproject::{ChunkGradients, UnprojectInput, unproject_chunk};
 use super::{ALPHA_FLOOR, CpuRasterizer, Picture, RasterError, Rendered, Splats};

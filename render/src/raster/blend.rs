@@ -1,12 +1,12 @@
 //! One tile, front to back: each splat sweeps the rows of its box, eight pixels at a time, and leaves its weights; then
 //! every channel is one multiply-add per row, so that more channels cost little.
 
+use super::grid::{TILE_H, TILE_W};
 use super::settings::{ALPHA_FLOOR, ALPHA_MIN, TRANSMITTANCE_STOP};
 use super::simd::{dispatch, exp2_neg_lanes, fma};
 use super::tile::{
     BATCH, Cut, EDGE, Finished, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, low_bits, mask, prefetch_records,
 };
-use super::tiles::{TILE_H, TILE_W};
 
 /// Channels every picture has: `sum(w)` and `sum(w z)`.
 const BASE_PLANES: usize = 2;

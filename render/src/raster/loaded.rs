@@ -4,8 +4,9 @@
 //! the reach of the ellipse, are the same at all times. Beside them lie the bounds of every 32 consecutive Gaussians,
 //! which let a view pass over those it cannot see without reading them.
 
+use super::block::{Block, Centers, LANES, Shapes};
 use super::motion::Motion;
-use super::project::{Block, Bounds, Centers, LANES, Shapes};
+use super::project::Bounds;
 use super::tile::FeatureRows;
 use super::{RasterError, Splats};
 use rayon::prelude::*;

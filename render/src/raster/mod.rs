@@ -7,7 +7,9 @@
 
 mod backward;
 mod blend;
+mod block;
 mod error;
+mod grid;
 mod loaded;
 mod motion;
 mod project;
@@ -37,13 +39,15 @@ pub use settings::{ALPHA_MIN, Convention, RasterSettings, TILE_RULE, TRANSMITTAN
 
 use crate::camera::View;
 use blend::{RowOut, Scratch, blend_tile};
+use block::{Block, LANES};
+use grid::{Grid, TILE_H, TILE_W};
 use loaded::Stored;
-use project::{Block, Camera, Footprints, LANES, Rules};
+use project::{Camera, Footprints, Rules};
 use rayon::prelude::*;
 use simd::Isa;
 use std::sync::atomic::AtomicUsize;
 use tile::{FeatureRows, TileEnd, TileInput};
-use tiles::{Chunk, ChunkCounts, ChunkInput, Grid, Source, TILE_H, TILE_W, fill_chunk};
+use tiles::{Chunk, ChunkCounts, ChunkInput, Source, fill_chunk};
 
 /// Most entries of all tile lists together (2 GiB of keys).
 pub const MAX_PAIRS: usize = 1 << 28;

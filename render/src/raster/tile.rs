@@ -1,8 +1,9 @@
 //! One tile as blending sees it, in either direction: its splats cut to it, its rows, and how it ended.
 
+use super::grid::{Record, TILE_H, TILE_W};
 use super::simd::prefetch;
 use super::sort::{key_depth, key_slot};
-use super::tiles::{Chunk, ChunkView, Record, TILE_H, TILE_W};
+use super::tiles::{Chunk, ChunkView};
 
 /// Pixels blended together.
 pub(crate) const WIDTH: usize = 8;

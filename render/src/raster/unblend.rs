@@ -5,10 +5,10 @@
 //! `dL/dalpha = T (G - R)`, where `R` is the loss per unit of light that passes: `R = 0` behind the last splat and
 //! `R += alpha (G - R)` in front of each. Nothing is subtracted from a total, so nothing cancels.
 
+use super::grid::{TILE_H, TILE_W};
 use super::settings::ALPHA_MIN;
 use super::simd::{dispatch, exp2_neg_lanes, fma};
 use super::tile::{BATCH, Cut, EDGE, PITCH, Row, TileEnd, TileInput, WIDTH, is_live, locate, mask, prefetch_records};
-use super::tiles::{TILE_H, TILE_W};
 use std::sync::atomic::Ordering;
 
 /// Planes of upstream gradients besides the features: alpha, `g_depth / A`, and the rendered depth `D`.

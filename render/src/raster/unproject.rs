@@ -5,7 +5,8 @@
 //! `dL/dcentre = sum(h lambda)` and `dL/dcov = sum(h lambda lambda^T) / 2`: the kept moments are all that is needed.
 
 use super::Splats;
-use super::project::{Block, Camera, LANES, Lane};
+use super::block::{Block, LANES, Lane};
+use super::project::Camera;
 use super::simd::{dispatch, fma64};
 use super::tiles::Chunk;
 use super::unblend::{MOMENTS, Moment};

@@ -31,7 +31,6 @@ pub(super) fn scenes(clip: &Clip, engine: &mut Engine, which: Use) -> Result<Vec
             map_from_anchor: reference.map_from_camera * camera_from_flu(),
             steps: vec![set.clone()],
             time_sec: vec![vec![0.0; set.frames.len()]],
-            new_steps: 1,
         };
         let scene = still(engine.step(&window, &clip.cameras)?);
         let stamp_ns = set.stamp_ns;

@@ -86,7 +86,6 @@ fn window(k: i64, rgb: RgbPicture) -> Window<Frame> {
         map_from_anchor: Rigid::IDENTITY,
         steps: vec![Arc::new(PosedSet { stamp_ns, epoch: 0, frames: vec![frame] })],
         time_sec: vec![vec![0.0]],
-        new_steps: 1,
     }
 }
 
