@@ -277,3 +277,44 @@ fn approximations_are_checked_first_and_then_now_and_then() {
     let (maker, _) = Standing::new().run(&any, 30, &nothing);
     assert_eq!((maker.skips().approximate, maker.skips().level), (0, 0));
 }
+
+/// Windows that go on from older ones, in those ones' frame: under a contract that lets them, and not under one that does not.
+#[test]
+fn older_timesteps_are_taken_again_under_the_contract() {
+    // A vehicle that drives.
+    let size = DriveOptions { seconds: 6.0, cameras: 1, width: 48, height: 32, ..DriveOptions::default() };
+    let moves = |d: &Drive| d.map_from_base(0.0).translation.distance(d.map_from_base(5.9).translation) > 20.0;
+    let drive = (0..20).map(|seed| Drive::new(&DriveOptions { seed, ..size.clone() }).unwrap()).find(moves).unwrap();
+    let cameras: Vec<_> = drive.cameras().iter().map(|c| c.intrinsics).collect();
+    let run = |config: &Config| {
+        let source = ModelSource::open(&config.model).unwrap();
+        let engine = Engine::new(source, &config.model, 1, config.window.timespan_sec).unwrap();
+        let engine = engine.with_skips(&config.skip);
+        let mut maker = StepMaker::new(engine, cameras.clone(), config, None).unwrap();
+        let mut builder = WindowBuilder::new(&config.window, 0);
+        let windows = (0..60).filter_map(|i| builder.push(posed_set(&drive, i).0));
+        let steps: Vec<Step> = windows.map(|w| maker.run(w).unwrap().unwrap()).collect();
+        (maker.skips(), steps)
+    };
+    let mut config = Config::default();
+    (config.skip.still, config.skip.reuse, config.skip.check_every) = (false, 3, 8);
+    (config.skip.max_psnr_loss_db, config.skip.max_flow_change, config.skip.max_mask_change) = (100.0, 100.0, 1.0);
+    let (counts, steps) = run(&config);
+    // Three of four windows could, where no check takes their place.
+    assert!(counts.approximate as usize > steps.len() / 3 && counts.broken == 0 && counts.checks > 2, "{counts:?}");
+    for step in &steps {
+        let anchored = step.window.steps[0].frames[0].map_from_camera.translation;
+        let ahead = step.window.map_from_anchor.translation.distance(anchored);
+        // Taken again: the frame is an older window's, behind this one's first timestep.
+        assert!(step.notch.is_some() || ahead < 1e-9, "{ahead}");
+        assert!(step.scene.gaussians.means.iter().flatten().all(|x| x.is_finite()));
+    }
+    assert!(steps.iter().any(|s| {
+        let first = &s.window.steps[0].frames[0].map_from_camera.translation;
+        s.notch == Some(Notch::Approximate) && s.window.map_from_anchor.translation.distance(*first) > 0.1
+    }));
+    (config.skip.max_psnr_loss_db, config.skip.max_flow_change, config.skip.max_mask_change) = (0.0, 0.0, 0.0);
+    let (counts, steps) = run(&config);
+    assert!(counts.approximate == 0 && counts.broken == counts.checks && counts.checks > 0, "{counts:?}");
+    assert!(steps.iter().all(|s| s.notch.is_none()));
+}

@@ -134,6 +134,17 @@ impl ClipBatch {
         })
     }
 
+    /// One timestep of every window, which keeps its time and its poses.
+    pub(crate) fn timestep(&self, t: usize) -> Result<Self, ModelError> {
+        Ok(Self {
+            image: self.image.narrow(1, t, 1)?.contiguous()?,
+            intrinsics: self.intrinsics.narrow(1, t, 1)?,
+            world_from_camera: self.world_from_camera.narrow(1, t, 1)?,
+            time_sec: self.time_sec.narrow(1, t, 1)?,
+            timespan_sec: self.timespan_sec,
+        })
+    }
+
     /// `(b, t, v, h, w)`, after checking that all tensors agree.
     pub(crate) fn dims(&self) -> Result<[usize; 5], ModelError> {
         let &[b, t, v, 3, h, w] = self.image.dims() else {

@@ -18,6 +18,6 @@ pub mod weights;
 pub use clip::{ClipBatch, PixelLayout, ViewInput};
 pub use config::ModelConfig;
 pub use error::ModelError;
-pub use network::{ClipOutput, Shortcuts, Stages, Storm};
+pub use network::{ClipOutput, Kept, Shortcuts, Stages, Storm};
 pub use ops::Precision;
 pub use scene::Scene;

@@ -18,6 +18,11 @@ fn storm() -> Storm {
 
 /// Pictures with a flat left half.
 fn clip(seed: usize) -> ClipBatch {
+    clip_of(seed, 0..TIMESTEPS)
+}
+
+/// The same of other timesteps, in the frame and on the clock of the first.
+fn clip_of(seed: usize, timesteps: std::ops::Range<usize>) -> ClipBatch {
     let picture = |t: usize, camera: usize| -> Vec<f32> {
         (0..3 * HEIGHT * WIDTH)
             .map(|i| match i / 3 % WIDTH < WIDTH / 2 {
@@ -26,11 +31,14 @@ fn clip(seed: usize) -> ClipBatch {
             })
             .collect()
     };
-    let pictures: Vec<Vec<Vec<f32>>> = (0..TIMESTEPS).map(|t| (0..CAMERAS).map(|c| picture(t, c)).collect()).collect();
-    let views: Vec<Vec<ViewInput>> = (0..TIMESTEPS)
-        .map(|t| {
+    let pictures: Vec<Vec<Vec<f32>>> =
+        timesteps.clone().map(|t| (0..CAMERAS).map(|c| picture(t, c)).collect()).collect();
+    let views: Vec<Vec<ViewInput>> = timesteps
+        .clone()
+        .zip(&pictures)
+        .map(|(t, pictures)| {
             let view = |c: usize| ViewInput {
-                rgb: &pictures[t][c],
+                rgb: &pictures[c],
                 intrinsics: Intrinsics { fx: 30.0, fy: 30.0, cx: 20.0, cy: 12.0, width: WIDTH, height: HEIGHT },
                 world_from_camera: Affine3A::from_rotation_y(c as f32)
                     * Affine3A::from_translation(Vec3::new(0.0, 0.0, t as f32)),
@@ -186,5 +194,66 @@ fn a_batch_is_its_windows() {
                 assert!(a.iter().zip(&b).all(|(x, y)| (x - y).abs() <= 1e-4 * x.abs().max(1.0)), "window {i}");
             }
         }
+    }
+}
+
+#[test]
+fn a_pass_that_leaves_something_says_the_same() {
+    let (storm, clip) = (storm(), clip(0));
+    let (output, kept) = storm.forward_keeping(&clip, Precision::F32).unwrap();
+    assert_eq!(apart(&storm.forward(&clip).unwrap(), &output), 0.0);
+    assert!(kept.bytes() > 4 * values(&output.means).len());
+}
+
+/// Per timestep: its part of `x` `(1, t, ...)`.
+fn timestep(x: &Tensor, t: usize) -> Vec<f32> {
+    values(&x.narrow(1, t, 1).unwrap())
+}
+
+/// Keys and values of the first block are of the input alone: with one block nothing is approximated but that older timesteps
+/// are what they were said to be before.
+#[test]
+fn with_one_block_a_pass_that_goes_on_is_exact() {
+    let config = ModelConfig { depth: 1, ..ModelConfig::preset("tiny").unwrap() };
+    let storm = Storm::untrained(&config, 3, &Device::Cpu).unwrap();
+    let (first, next) = (clip_of(0, 0..3), clip_of(0, 1..4));
+    let (before, kept) = storm.forward_keeping(&first, Precision::F32).unwrap();
+    let (output, _) = storm.forward_reusing(&next, &kept, Precision::F32).unwrap();
+    let full = storm.forward(&next).unwrap();
+    for ((now, whole), then) in parts(&output).iter().zip(&parts(&full)).zip(&parts(&before)).take(8) {
+        assert_eq!(now.dims(), whole.dims());
+        for (a, b) in timestep(now, 2).iter().zip(&timestep(whole, 2)) {
+            assert!((a - b).abs() <= 1e-4 * b.abs().max(1.0), "{a} {b}");
+        }
+        assert_eq!((timestep(now, 0), timestep(now, 1)), (timestep(then, 1), timestep(then, 2)));
+    }
+}
+
+#[test]
+fn passes_go_on_from_each_other_and_stay_near_the_full_ones() {
+    let storm = storm();
+    let (_, mut kept) = storm.forward_keeping(&clip_of(0, 0..3), Precision::F32).unwrap();
+    for first in 1..4 {
+        let next = clip_of(0, first..first + 3);
+        let (output, left) = storm.forward_reusing(&next, &kept, Precision::F32).unwrap();
+        let error = apart(&storm.forward(&next).unwrap(), &output);
+        assert!(error > 1e-6 && error < 0.5, "{first}: {error}");
+        let (whole, _) = storm.forward_reusing(&next, &kept, Precision::Int16).unwrap();
+        assert!(apart(&output, &whole) < 5e-3);
+        kept = left;
+    }
+    // A window that grows by a timestep.
+    let (output, _) = storm.forward_reusing(&clip_of(0, 3..7), &kept, Precision::F32).unwrap();
+    assert_eq!(output.means.dims()[1], 4);
+}
+
+#[test]
+fn windows_that_cannot_go_on_are_refused() {
+    let storm = storm();
+    let (_, kept) = storm.forward_keeping(&clip_of(0, 0..3), Precision::F32).unwrap();
+    let two = ClipBatch::stack(&[clip_of(0, 1..4), clip_of(1, 1..4)]).unwrap();
+    for wrong in [two, clip_of(0, 0..5), clip_of(0, 0..1)] {
+        let error = storm.forward_reusing(&wrong, &kept, Precision::F32).unwrap_err().to_string();
+        assert!(error.contains("cannot go on"), "{error}");
     }
 }

@@ -6,6 +6,7 @@ mod motion;
 mod output;
 mod params;
 mod resample;
+mod reuse;
 mod shortcuts;
 mod sky;
 mod stages;
@@ -20,6 +21,7 @@ use candle_core::{DType, Device, Tensor};
 pub use output::ClipOutput;
 pub(crate) use params::NORM_EPS;
 use params::Params;
+pub use reuse::Kept;
 pub use shortcuts::{MAX_KV_POOL, MAX_MERGE, Shortcuts};
 pub use stages::Stages;
 use tokens::{Grid, TokenPlan};
@@ -134,7 +136,7 @@ impl Storm {
 
     fn run(&self, batch: &ClipBatch, shortcuts: &Shortcuts, stages: &mut Stages) -> Result<ClipOutput, ModelError> {
         let config = &*self.config;
-        let [b, timesteps, v, h, w] = batch.dims()?;
+        let [_, timesteps, v, h, w] = batch.dims()?;
         self.check_sizes(v, h, w)?;
         let (rows, cols) = (h / config.patch_size, w / config.patch_size);
         let grid = Grid { timesteps, cameras: v, rows, cols };
@@ -153,8 +155,27 @@ impl Storm {
         let plan = TokenPlan::new(shortcuts, grid, extra, activity.as_deref());
         let tokens = self.transformer.forward(tokens, &plan, shortcuts.precision, stages)?;
 
-        // From here on only the timesteps that come out.
         let newest = (shortcuts.newest_only && timesteps > 1).then_some(timesteps - 1);
+        let mut output = self.decode(batch, rays, &tokens, newest, stages)?;
+        if let Some(keep) = &shortcuts.keep {
+            output.hide(keep, grid)?;
+        }
+        Ok(output)
+    }
+
+    /// Gaussians, sky and exposure of the normed tokens `[sky | affine | motion | patches]`; of one timestep, whose patches alone
+    /// they are then, or of all.
+    fn decode(
+        &self,
+        batch: &ClipBatch,
+        rays: Rays,
+        tokens: &Tensor,
+        newest: Option<usize>,
+        stages: &mut Stages,
+    ) -> Result<ClipOutput, ModelError> {
+        let config = &*self.config;
+        let [b, _, v, h, w] = batch.dims()?;
+        let (rows, cols) = (h / config.patch_size, w / config.patch_size);
         let (image, time_sec, rays) = match newest {
             Some(t) => (batch.image.narrow(1, t, 1)?, batch.time_sec.narrow(1, t, 1)?, rays.timestep(t)?),
             None => (batch.image.clone(), batch.time_sec.clone(), rays),
@@ -176,7 +197,7 @@ impl Storm {
 
         let gaussians = self.gaussians.forward(config, &image_tokens, &image, &rays, stages)?;
         let motion = self.motion.forward(config, &image_tokens, motion_tokens.as_ref(), dims, stages)?;
-        let mut output = ClipOutput {
+        Ok(ClipOutput {
             means: gaussians.means,
             scales: gaussians.scales,
             quats: gaussians.quats,
@@ -192,11 +213,7 @@ impl Storm {
             time_sec,
             config: Arc::clone(&self.config),
             sky: self.sky.clone(),
-        };
-        if let Some(keep) = &shortcuts.keep {
-            output.hide(keep, grid)?;
-        }
-        Ok(output)
+        })
     }
 
     /// The position embedding on a patch grid, `(1, rows * cols, embed_dim)`; none when the network has none.

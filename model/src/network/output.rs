@@ -71,6 +71,57 @@ impl ClipOutput {
         })
     }
 
+    /// The last `timesteps` timesteps.
+    pub(super) fn last(&self, timesteps: usize) -> Result<Self, ModelError> {
+        let part = |x: &Tensor| x.narrow(1, x.dim(1)?.saturating_sub(timesteps), timesteps);
+        Ok(Self {
+            means: part(&self.means)?,
+            scales: part(&self.scales)?,
+            quats: part(&self.quats)?,
+            opacities: part(&self.opacities)?,
+            colors: part(&self.colors)?,
+            depths: part(&self.depths)?,
+            velocity_backward: part(&self.velocity_backward)?,
+            velocity_forward: part(&self.velocity_forward)?,
+            motion_weights: self.motion_weights.as_ref().map(part).transpose()?,
+            time_sec: part(&self.time_sec)?,
+            ..self.clone()
+        })
+    }
+
+    /// Earlier timesteps and then this output's; sky, exposure and velocity bases are this one's.
+    pub(super) fn after(self, earlier: &Self) -> Result<Self, ModelError> {
+        let cat = |pick: fn(&Self) -> &Tensor| Tensor::cat(&[pick(earlier), pick(&self)], 1);
+        let weights = match (&earlier.motion_weights, &self.motion_weights) {
+            (Some(before), Some(now)) => Some(Tensor::cat(&[before, now], 1)?),
+            _ => None,
+        };
+        Ok(Self {
+            means: cat(|o| &o.means)?,
+            scales: cat(|o| &o.scales)?,
+            quats: cat(|o| &o.quats)?,
+            opacities: cat(|o| &o.opacities)?,
+            colors: cat(|o| &o.colors)?,
+            depths: cat(|o| &o.depths)?,
+            velocity_backward: cat(|o| &o.velocity_backward)?,
+            velocity_forward: cat(|o| &o.velocity_forward)?,
+            motion_weights: weights,
+            time_sec: cat(|o| &o.time_sec)?,
+            motion_bases: self.motion_bases.clone(),
+            affine: self.affine.clone(),
+            sky_token: self.sky_token.clone(),
+            config: Arc::clone(&self.config),
+            sky: self.sky.clone(),
+        })
+    }
+
+    /// Bytes of its tensors.
+    pub(super) fn bytes(&self) -> usize {
+        let parts = [&self.means, &self.scales, &self.quats, &self.opacities, &self.colors, &self.depths];
+        let motion = [&self.velocity_backward, &self.velocity_forward].into_iter().chain(&self.motion_weights);
+        parts.into_iter().chain(motion).map(|x| x.elem_count() * x.dtype().size_in_bytes()).sum()
+    }
+
     /// Several windows' outputs as one batch.
     pub(super) fn stack(each: &[Self]) -> Result<Self, ModelError> {
         let Some(first) = each.first() else { return Err(ModelError::Input("no windows to stack".into())) };

@@ -82,6 +82,34 @@ impl Transformer {
         stages.keep("tokens_norm", &x);
         Ok(x)
     }
+
+    /// `(b, n, d)` to `(b, n, d)`, and of every block the keys and values of all patches, older ones first, `(b, m, 2 d)`.
+    pub fn forward_taking(
+        &self,
+        tokens: Tensor,
+        taken: &Taken<'_>,
+        precision: Precision,
+    ) -> Result<(Tensor, Vec<Tensor>), ModelError> {
+        let (mut x, mut kept) = (tokens, Vec::with_capacity(self.blocks.len()));
+        for (k, block) in self.blocks.iter().enumerate() {
+            let older = taken
+                .older
+                .map(|all| all.get(k).ok_or_else(|| ModelError::Input(format!("no keys are kept for block {k}"))));
+            let (out, keys_values) =
+                block.forward_taking(&x, taken.extra, older.transpose()?, self.heads, precision)?;
+            kept.push(keys_values);
+            x = out;
+        }
+        Ok((self.norm.forward(&x)?, kept))
+    }
+}
+
+/// What a pass over a window's newest tokens takes of the older ones.
+pub(crate) struct Taken<'a> {
+    /// Tokens at the front that are no patches: their keys are not kept.
+    pub extra: usize,
+    /// Keys and values of older patches, one `(b, n, 2 d)` per block; none: all tokens are new.
+    pub older: Option<&'a [Tensor]>,
 }
 
 /// Takes what is only computed when it is kept.
@@ -119,15 +147,48 @@ impl Block {
             probe("attn", &|| &attended - x)?;
         }
         probe("norm2", &|| self.norm2.forward(&attended))?;
+        let out = self.mlp(&attended, precision)?;
+        probe("mlp", &|| &out - &attended)?;
+        Ok(out)
+    }
+
+    /// The second half: norm and MLP, added to what comes in.
+    fn mlp(&self, x: &Tensor, precision: Precision) -> candle_core::Result<Tensor> {
         let (fc1, fc2) = (self.fc1.at(precision), self.fc2.at(precision));
         let steps = [
             self.norm2.step(Activation::None),
             Step::Linear(&fc1, Activation::Gelu),
             Step::Linear(&fc2, Activation::None),
         ];
-        let out = chain(&attended, &steps, Some(&attended))?;
-        probe("mlp", &|| &out - &attended)?;
-        Ok(out)
+        chain(x, &steps, Some(x))
+    }
+
+    /// The block over `[extra | new patches]` whose keys are theirs and those of `older` patches; and all patches' keys and
+    /// values, older ones first.
+    fn forward_taking(
+        &self,
+        x: &Tensor,
+        extra: usize,
+        older: Option<&Tensor>,
+        heads: usize,
+        precision: Precision,
+    ) -> candle_core::Result<(Tensor, Tensor)> {
+        let (_, n, d) = x.dims3()?;
+        let (qkv, proj) = (self.qkv.at(precision), self.proj.at(precision));
+        let qkv = chain(x, &[self.norm1.step(Activation::None), Step::Linear(&qkv, Activation::None)], None)?;
+        let keys_values = qkv.narrow(2, d, 2 * d)?;
+        let patches = keys_values.narrow(1, extra, n - extra)?;
+        let (attended, patches) = match older {
+            None => (attention_at(&qkv, heads, precision)?, patches.contiguous()?),
+            Some(older) => {
+                let patches = Tensor::cat(&[older, &patches], 1)?;
+                let keys_values = Tensor::cat(&[&keys_values.narrow(1, 0, extra)?, &patches], 1)?;
+                let queries = qkv.narrow(2, 0, d)?.contiguous()?;
+                (cross_attention(&queries, &keys_values, None, heads, precision)?, patches)
+            }
+        };
+        let attended = linear(&attended, &proj, Activation::None, Some(x))?;
+        Ok((self.mlp(&attended, precision)?, patches))
     }
 
     /// Attention whose queries are not its keys, added to the queries' tokens.

@@ -98,6 +98,35 @@ fn any_number_of_threads_gives_the_same_batches() {
 }
 
 #[test]
+fn an_early_anchor_moves_frame_and_clock_and_nothing_else() {
+    let usual = small();
+    let early = ClipOptions { anchor_lead: 2, ..usual };
+    let config = ModelConfig::preset("tiny").unwrap();
+    let plans = (0..60).map(|k| (ClipPlan::training(1, k, &usual), ClipPlan::training(1, k, &early)));
+    let mut leads = std::collections::BTreeMap::new();
+    for (a, b) in plans {
+        assert_eq!(a, ClipPlan { lead_sec: 0.0, ..b.clone() });
+        assert!(b.lead_sec <= b.start_sec);
+        let count = leads.entry((2.0 * b.lead_sec) as usize).or_insert(0);
+        *count += 1;
+        if *count > 1 {
+            continue;
+        }
+        let (one, other) = (a.make(&usual, &config).unwrap(), b.make(&early, &config).unwrap());
+        let numbers = |x: &Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert_eq!(numbers(&one.context.image), numbers(&other.context.image));
+        let later = numbers(&one.context.time_sec).iter().map(|t| t + b.lead_sec as f32).collect::<Vec<_>>();
+        assert_eq!(numbers(&other.context.time_sec), later);
+        // The first reference camera is where the vehicle had driven to by then.
+        let pose = numbers(&other.context.world_from_camera);
+        let far = [3, 7, 11].map(|i| pose[16 * usual.reference() + i]).iter().map(|x| x * x).sum::<f32>().sqrt();
+        assert!(b.lead_sec > 0.0 || far < 1e-5, "{far}");
+        assert!(far < 40.0 * b.lead_sec as f32 + 1e-5, "{far}");
+    }
+    assert_eq!(leads.keys().copied().collect::<Vec<_>>(), [0, 1, 2], "{leads:?}");
+}
+
+#[test]
 fn variety_changes_lenses_and_cameras_and_nothing_else() {
     let usual = ClipOptions::default();
     let varied = ClipOptions { variety: true, ..usual };

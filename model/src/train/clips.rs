@@ -46,7 +46,13 @@ pub struct ClipOptions {
     pub traffic: [f64; 2],
     /// Whether lenses vary from clip to clip, and the number of cameras (up to `cameras`) from block to block of batches.
     pub variety: bool,
+    /// Strides the anchor may lie before the first timestep, where the clock then begins too: windows that go on in the frame
+    /// of an earlier one (`Storm::forward_reusing`) look so. 0: at the first timestep, the paper's.
+    pub anchor_lead: u32,
 }
+
+/// Share of the clips whose anchor is at the first timestep all the same.
+const NO_LEAD_SHARE: f64 = 0.5;
 
 /// Share of the clips that keep the drive's own lenses where lenses vary.
 const OWN_LENS_SHARE: f64 = 0.5;
@@ -67,6 +73,7 @@ impl Default for ClipOptions {
             drive_sec: 12.0,
             traffic: [0.75, 2.5],
             variety: false,
+            anchor_lead: 0,
         }
     }
 }
@@ -122,6 +129,8 @@ pub struct ClipPlan {
     pub traffic: f64,
     /// Factors on the focal lengths.
     pub zoom: [f32; 2],
+    /// How long before `start_sec` the anchor was where it is, and the clock began, seconds.
+    pub lead_sec: f64,
 }
 
 impl ClipPlan {
@@ -132,12 +141,16 @@ impl ClipPlan {
         let drive_seed = rng.random_range(HELD_OUT_SEEDS.end..u64::MAX);
         let [low, high] = options.traffic;
         let traffic = low + (high - low) * rng.random::<f64>();
-        let plan = Self::draw(drive_seed, traffic, &mut rng, options);
-        if !options.variety || rng.random::<f64>() < OWN_LENS_SHARE {
-            return plan;
+        let mut plan = Self::draw(drive_seed, traffic, &mut rng, options);
+        if options.variety && rng.random::<f64>() >= OWN_LENS_SHARE {
+            plan.zoom = ZOOM.map(|[low, high]| (low * (high / low).powf(rng.random::<f64>())) as f32);
         }
-        let zoom = ZOOM.map(|[low, high]| (low * (high / low).powf(rng.random::<f64>())) as f32);
-        Self { zoom, ..plan }
+        // No earlier than the drive begins.
+        let most = f64::from(options.anchor_lead).min((plan.start_sec / options.stride_sec).floor()) as u32;
+        if most > 0 && rng.random::<f64>() >= NO_LEAD_SHARE {
+            plan.lead_sec = f64::from(rng.random_range(1..=most)) * options.stride_sec;
+        }
+        plan
     }
 
     /// A clip of a given drive, for validation: usual traffic, moments drawn from the drive's seed.
@@ -152,7 +165,7 @@ impl ClipPlan {
         let mut target_sec: Vec<f64> =
             (0..options.targets).map(|_| rng.random_range(0..frames) as f64 / RATE_HZ).collect();
         target_sec.sort_by(f64::total_cmp);
-        Self { drive_seed, start_sec, target_sec, traffic, zoom: [1.0; 2] }
+        Self { drive_seed, start_sec, target_sec, traffic, zoom: [1.0; 2], lead_sec: 0.0 }
     }
 
     /// Drives it. `config` says what the network's depth measures and where its rays pass.
@@ -169,8 +182,9 @@ impl ClipPlan {
             zoom: self.zoom,
             ..DriveOptions::default()
         })?;
-        let anchor_from_map =
-            inverse(&(map_from_camera(&drive, options.reference(), self.start_sec) * camera_from_flu()));
+        let anchor_from_map = inverse(
+            &(map_from_camera(&drive, options.reference(), self.start_sec - self.lead_sec) * camera_from_flu()),
+        );
         let context_sec: Vec<f64> = (0..options.timesteps).map(|k| k as f64 * options.stride_sec).collect();
         let shots = |times: &[f64]| self.shots(&drive, times, &anchor_from_map);
         let context = shots(&context_sec);
@@ -196,7 +210,7 @@ impl ClipPlan {
                 frame: drive.render(camera, at),
                 intrinsics: drive.cameras()[camera].intrinsics,
                 anchor_from_camera: affine32(&pose),
-                time_sec: time_sec as f32,
+                time_sec: (self.lead_sec + time_sec) as f32,
             }
         };
         times.iter().map(|&t| (0..drive.cameras().len()).map(|c| shot(c, t)).collect()).collect()

@@ -181,7 +181,7 @@ impl TrainOptions {
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
-            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
+            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
             self.history,
             self.seed,
             c.cameras,
@@ -191,6 +191,10 @@ impl TrainOptions {
             self.one_camera_steps,
             self.reuse,
             if c.variety { ", varied lenses and numbers of cameras" } else { "" },
+            match c.anchor_lead {
+                0 => String::new(),
+                n => format!(", anchors up to {n} strides early"),
+            },
             self.batch,
             match self.optimizer {
                 Optimizer::AdamW => "AdamW",

@@ -86,6 +86,10 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         let text = "skip.newest_only = true: scoring wants the Gaussians of every timestep; leave it out";
         return Err(UsageError(text.into()).into());
     }
+    if config.skip.reuse > 0 {
+        let text = "skip.reuse: clips are scored one by one, none goes on from another; leave it out (`storm bench` scores it on drives)";
+        return Err(UsageError(text.into()).into());
+    }
     let source = ModelSource::open(&config.model)?;
     let size = source.picture_size(&config.model)?;
     let data = Data::open(args, &config, size)?;

@@ -143,6 +143,8 @@ section! {
         merge: f64 = 0.0,
         /// The last block and the heads work on the newest timestep alone: results are those of all, but only its Gaussians are there for the map and for drawing other times.
         newest_only: bool = false,
+        /// Windows in a row that compute their newest timestep alone and take the older ones, keys, values and Gaussians, from the window one stride before, in its frame; then one is computed in full. 0: off. `--anchor-lead` trains weights for it.
+        reuse: usize = 0,
         /// Patches that were sky when last computed, far from anything else, and look the same are not computed (one window at a time: not with `--batch`).
         sky: bool = false,
         /// A patch is sky when no pixel of it was more opaque than this.

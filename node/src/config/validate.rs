@@ -41,6 +41,18 @@ impl Config {
         between("skip.merge", self.skip.merge, 0.0, f64::from(MAX_MERGE))?;
         between("skip.sky_opacity", self.skip.sky_opacity, 0.0, 1.0)?;
         count("skip.sky_every", self.skip.sky_every, 0, 1_000_000)?;
+        count("skip.reuse", self.skip.reuse, 0, 100)?;
+        let skip = &self.skip;
+        let others = [
+            ("skip.kv_pool", skip.kv_pool > 1),
+            ("skip.merge", skip.merge > 0.0),
+            ("skip.newest_only", skip.newest_only),
+            ("skip.sky", skip.sky),
+        ];
+        if let Some((key, _)) = others.iter().find(|(_, on)| *on && skip.reuse > 0) {
+            let expected = format!("wants 0 together with {key}");
+            return Err(ConfigError::Value { key: "skip.reuse", value: skip.reuse.to_string(), expected });
+        }
         between("overlap.depth_gate", self.overlap.depth_gate, 0.0, 1.0)?;
         between("overlap.max_color_step", self.overlap.max_color_step, 0.0, 1.0)?;
         between("map.tile_m", self.map.tile_m, 1.0, 1000.0)?;

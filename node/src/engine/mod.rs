@@ -2,6 +2,7 @@
 
 pub mod evaluate;
 pub mod figures;
+mod reuse;
 pub mod score;
 pub mod select;
 mod sky;
@@ -25,6 +26,7 @@ use crate::config::{ModelConfigSection, SkipConfig};
 use crate::rigid::Rigid;
 use crate::source::Frame;
 use crate::window::{PosedSet, Window, relative};
+use reuse::{Left, Reuse};
 use sky::SkyPatches;
 
 /// How the weights a run used are called in metrics.json and the report when there are none.
@@ -116,6 +118,7 @@ pub struct Engine {
     weights: String,
     shortcuts: Shortcuts,
     sky: SkyPatches,
+    reuse: Reuse,
 }
 
 impl Engine {
@@ -140,7 +143,8 @@ impl Engine {
             warn!("model.precision = bf16 rounds as bf16 units would, in f32 arithmetic: it is not faster than f32");
         }
         let sky = SkyPatches::new(&SkipConfig::default(), model.config().patch_size);
-        Ok(Self { model, raster, device, timespan_sec, weights, shortcuts, sky })
+        let reuse = Reuse::new(0);
+        Ok(Self { model, raster, device, timespan_sec, weights, shortcuts, sky, reuse })
     }
 
     /// The same, leaving out what the configuration allows.
@@ -150,6 +154,7 @@ impl Engine {
         self.shortcuts.merge = skip.merge as f32;
         self.shortcuts.newest_only = skip.newest_only;
         self.sky = SkyPatches::new(skip, self.model.config().patch_size);
+        self.reuse = Reuse::new(skip.reuse);
         self
     }
 
@@ -158,20 +163,21 @@ impl Engine {
         &self.shortcuts
     }
 
-    /// Makes anew all that a step changes: the rasteriser and its buffers, what was seen of the sky. The network only ever
-    /// reads its weights.
+    /// Makes anew all that a step changes: the rasteriser and its buffers, what was seen of the sky, what steps left for later
+    /// ones. The network only ever reads its weights.
     ///
     /// # Errors
     /// None that [`Engine::new`] would not have met.
     pub fn restart(&mut self) -> Result<()> {
         self.raster = CpuRasterizer::new(self.model.config().raster_settings())?;
         self.sky.forget();
+        self.reuse.forget();
         Ok(())
     }
 
-    /// Whether steps leave anything out or round anything at present.
-    pub fn approximates(&self) -> bool {
-        !self.shortcuts.exact() || self.sky.enabled()
+    /// Whether a step over this window would leave anything out or round anything.
+    pub fn approximates(&self, window: &Window<Frame>, cameras: &[Intrinsics]) -> bool {
+        !self.shortcuts.exact() || self.sky.enabled() || self.reuse.at_hand(window, cameras).is_some()
     }
 
     /// The network's configuration.
@@ -195,7 +201,23 @@ impl Engine {
         scenes.pop().context("the network gave no scene")?
     }
 
-    /// The same, leaving nothing out and rounding nothing.
+    /// As [`Engine::step`], with all that may be left out: where older timesteps are at hand the newest alone is computed, and
+    /// the scene is in the frame of the anchor they were computed in, which comes with it. The clock is the window's own.
+    pub fn shortest_step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<(Rigid, Scene)> {
+        let Some(left) = self.reuse.take(window, cameras) else {
+            return Ok((window.map_from_anchor, self.step(window, cameras)?));
+        };
+        let window = left.placed(window);
+        let (output, kept) =
+            self.model.forward_reusing(&self.clip(&window, cameras)?, &left.kept, self.shortcuts.precision)?;
+        let mut scene = output.scene(0)?;
+        scene.gaussians.time_sec.iter_mut().for_each(|t| *t -= left.lead_sec(&window) as f32);
+        let map_from_anchor = window.map_from_anchor;
+        self.reuse.leave(left.followed_by(window, kept));
+        Ok((map_from_anchor, scene))
+    }
+
+    /// The same as [`Engine::step`], leaving nothing out and rounding nothing.
     pub fn exact_step(&mut self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<Scene> {
         let mut scenes = self.exact_steps(&[window], cameras)?;
         scenes.pop().context("the network gave no scene")?
@@ -224,6 +246,12 @@ impl Engine {
         let output = match (clips.as_slice(), windows) {
             ([], _) => return Ok(Vec::new()),
             ([one], [window]) => {
+                if self.reuse.enabled() {
+                    let (output, kept) = self.model.forward_keeping(one, shortcuts.precision)?;
+                    let scene = self.judged(window, output.scene(0), None)?;
+                    self.reuse.leave(Left::new((*window).clone(), cameras.to_vec(), kept));
+                    return Ok(vec![Ok(scene)]);
+                }
                 let keep = if exact { None } else { self.sky.keep(window, cameras) };
                 let shortcuts = Shortcuts { keep, ..shortcuts };
                 let scene = self.model.forward_with(one, &shortcuts)?.scene(0);

@@ -39,13 +39,18 @@ const NETWORK: [Row; 16] = [
 ];
 
 /// Settings of whole drives: what is skipped, and under which contract.
-const DRIVES: [Row; 5] = [
+const DRIVES: [Row; 6] = [
     ("default", &[], false),
     ("prediction", &["skip.predict=true"], false),
     ("int8", &["model.precision=int8"], false),
     (
         "prediction, contract 1 dB, flow and masks free",
         &["skip.predict=true", "skip.max_psnr_loss_db=1", "skip.max_flow_change=100", "skip.max_mask_change=1"],
+        false,
+    ),
+    (
+        "older timesteps taken again, contract 1 dB, flow and masks free",
+        &["skip.reuse=3", "skip.max_psnr_loss_db=1", "skip.max_flow_change=100", "skip.max_mask_change=1"],
         false,
     ),
     (

@@ -44,6 +44,10 @@ pub struct RecipeArgs {
     /// than the drives' [small: varied, paper: own].
     #[arg(long, value_parser = ["own", "varied"])]
     lenses: Option<String>,
+    /// Strides that the anchor of half the drives' clips may lie before their first timestep, the clock beginning there, for
+    /// weights that keep their accuracy where steps go on in an older frame (skip.reuse) [0: the paper's].
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=8))]
+    anchor_lead: u32,
     /// How often each clip is shown, at least 1; driving a clip costs a quarter of learning from it [small: 2, paper: 1].
     #[arg(long)]
     reuse: Option<u64>,
@@ -95,6 +99,7 @@ impl RecipeArgs {
         let structure_from = if small { steps * 2 / 3 } else { 5000 };
         options.render.structure_from_step = self.structure_from.unwrap_or(structure_from);
         options.clips.variety = self.lenses.as_deref().map_or(small, |l| l == "varied");
+        options.clips.anchor_lead = self.anchor_lead;
         options.reuse = self.reuse.unwrap_or(if small { 2 } else { 1 });
         Ok(())
     }

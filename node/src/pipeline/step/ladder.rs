@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
-use glam::Quat;
 use storm_model::scene::{RenderedView, Scene, Want};
 use tracing::debug;
 
@@ -14,6 +13,7 @@ use crate::gate::contract::{Difference, Notch, Verdict};
 use crate::gate::predict::{explains, moved_on, pixel_flow};
 use crate::gate::skipper::{Computed, Plan, Shadow, UNLIKE, difference};
 use crate::pipeline::demand::Demand;
+use crate::rigid::Rigid;
 use crate::source::Frame;
 use crate::sync::clock::seconds_between;
 use crate::window::Window;
@@ -61,16 +61,21 @@ impl StepMaker {
         self.enter(Part::Network);
         // What a skipped step is compared with leaves nothing out.
         let verdict = match shadow {
-            None if self.engine.approximates() => self.skipper.may_approximate(),
+            None if self.engine.approximates(&window, &self.cameras) => self.skipper.may_approximate(),
             _ => Verdict::Full,
         };
         if verdict == Verdict::Skip {
-            let scene = self.engine.step(&window, &self.cameras);
-            let ran = Ran { scene, ms: start.elapsed().as_secs_f64() * 1e3, approximate: true };
-            return self.take_in(window, ran, demand, None);
+            let rough = self.engine.shortest_step(&window, &self.cameras);
+            let ms = start.elapsed().as_secs_f64() * 1e3;
+            let (map_from_anchor, scene) = match rough {
+                Ok((anchor, scene)) => (anchor, Ok(scene)),
+                Err(e) => (window.map_from_anchor, Err(e)),
+            };
+            let window = Window { map_from_anchor, ..window };
+            return self.take_in(window, Ran { scene, ms, approximate: true }, demand, None);
         }
         // Before the exact step, from which the engine learns what is sky in this very window.
-        let rough = (verdict == Verdict::Check).then(|| self.engine.step(&window, &self.cameras));
+        let rough = (verdict == Verdict::Check).then(|| self.engine.shortest_step(&window, &self.cameras));
         let rough_ms = start.elapsed().as_secs_f64() * 1e3;
         let start = Instant::now();
         let scene = self.engine.exact_step(&window, &self.cameras);
@@ -84,14 +89,17 @@ impl StepMaker {
         self.take_in(window, ran, demand, shadow.as_ref())
     }
 
-    /// How an approximation compares with the exact step of the same window.
-    fn apart(&mut self, window: &Window<Frame>, exact: &Scene, rough: Option<&Scene>) -> Result<Difference> {
-        let Some(rough) = rough else { return Ok(UNLIKE) };
+    /// How an approximation, in the frame of its own anchor, compares with the exact step of the same window.
+    fn apart(&mut self, window: &Window<Frame>, exact: &Scene, rough: Option<&(Rigid, Scene)>) -> Result<Difference> {
+        let Some((rough_anchor, rough)) = rough else { return Ok(UNLIKE) };
         let newest = &window.steps[window.steps.len() - 1];
-        let targets = views_of(newest, &window.map_from_anchor, &self.cameras);
         let (time_sec, want) = (newest_time_sec(window), Want { flow: true, motion: false });
-        let mut draw = |scene: &Scene| self.engine.render(scene, &targets, time_sec, want);
-        Ok(difference(newest, &draw(exact)?, &draw(rough)?, Quat::IDENTITY))
+        let mut draw = |scene: &Scene, anchor: &Rigid| {
+            self.engine.render(scene, &views_of(newest, anchor, &self.cameras), time_sec, want)
+        };
+        let (full, skipped) = (draw(exact, &window.map_from_anchor)?, draw(rough, rough_anchor)?);
+        let turn = window.map_from_anchor.rotation.conjugate() * rough_anchor.rotation;
+        Ok(difference(newest, &full, &skipped, turn.as_quat()))
     }
 
     /// The last computed step drawn at the window's newest time and poses, where that explains its pictures everywhere.
