@@ -91,11 +91,13 @@ impl ClipOutput {
 
     /// Earlier timesteps and then this output's; sky, exposure and velocity bases are this one's.
     pub(super) fn after(self, earlier: &Self) -> Result<Self, ModelError> {
-        let cat = |pick: fn(&Self) -> &Tensor| Tensor::cat(&[pick(earlier), pick(&self)], 1);
-        let weights = match (&earlier.motion_weights, &self.motion_weights) {
-            (Some(before), Some(now)) => Some(Tensor::cat(&[before, now], 1)?),
-            _ => None,
-        };
+        self.joined(&[earlier, &self], 1)
+    }
+
+    /// What these outputs say of pixels, one after the other along an axis; what they say of windows is this one's.
+    fn joined(&self, each: &[&Self], axis: usize) -> Result<Self, ModelError> {
+        let cat = |pick: fn(&Self) -> &Tensor| Tensor::cat(&each.iter().map(|o| pick(o)).collect::<Vec<_>>(), axis);
+        let weights: Option<Vec<&Tensor>> = each.iter().map(|o| o.motion_weights.as_ref()).collect();
         Ok(Self {
             means: cat(|o| &o.means)?,
             scales: cat(|o| &o.scales)?,
@@ -105,13 +107,9 @@ impl ClipOutput {
             depths: cat(|o| &o.depths)?,
             velocity_backward: cat(|o| &o.velocity_backward)?,
             velocity_forward: cat(|o| &o.velocity_forward)?,
-            motion_weights: weights,
+            motion_weights: weights.map(|all| Tensor::cat(&all, axis)).transpose()?,
             time_sec: cat(|o| &o.time_sec)?,
-            motion_bases: self.motion_bases.clone(),
-            affine: self.affine.clone(),
-            sky_token: self.sky_token.clone(),
-            config: Arc::clone(&self.config),
-            sky: self.sky.clone(),
+            ..self.clone()
         })
     }
 
@@ -125,27 +123,15 @@ impl ClipOutput {
     /// Several windows' outputs as one batch.
     pub(super) fn stack(each: &[Self]) -> Result<Self, ModelError> {
         let Some(first) = each.first() else { return Err(ModelError::Input("no windows to stack".into())) };
-        let cat = |pick: fn(&Self) -> &Tensor| Tensor::cat(&each.iter().map(pick).collect::<Vec<_>>(), 0);
         let some = |pick: fn(&Self) -> Option<&Tensor>| {
             let all: Option<Vec<&Tensor>> = each.iter().map(pick).collect();
             all.map(|all| Tensor::cat(&all, 0)).transpose()
         };
         Ok(Self {
-            means: cat(|o| &o.means)?,
-            scales: cat(|o| &o.scales)?,
-            quats: cat(|o| &o.quats)?,
-            opacities: cat(|o| &o.opacities)?,
-            colors: cat(|o| &o.colors)?,
-            depths: cat(|o| &o.depths)?,
-            velocity_backward: cat(|o| &o.velocity_backward)?,
-            velocity_forward: cat(|o| &o.velocity_forward)?,
-            motion_weights: some(|o| o.motion_weights.as_ref())?,
             motion_bases: some(|o| o.motion_bases.as_ref())?,
             affine: some(|o| o.affine.as_ref())?,
             sky_token: some(|o| o.sky_token.as_ref())?,
-            time_sec: cat(|o| &o.time_sec)?,
-            config: Arc::clone(&first.config),
-            sky: first.sky.clone(),
+            ..first.joined(&each.iter().collect::<Vec<_>>(), 0)?
         })
     }
 
