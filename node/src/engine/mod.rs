@@ -248,9 +248,12 @@ impl Engine {
             ([one], [window]) => {
                 if self.reuse.enabled() {
                     let (output, kept) = self.model.forward_keeping(one, shortcuts.precision)?;
-                    let scene = self.judged(window, output.scene(0), None)?;
-                    self.reuse.leave(Left::new((*window).clone(), cameras.to_vec(), kept));
-                    return Ok(vec![Ok(scene)]);
+                    let scene = self.judged(window, output.scene(0), None);
+                    // Nothing goes on from what is not finite.
+                    if scene.is_ok() {
+                        self.reuse.leave(Left::new((*window).clone(), cameras.to_vec(), kept));
+                    }
+                    return Ok(vec![scene]);
                 }
                 let keep = if exact { None } else { self.sky.keep(window, cameras) };
                 let shortcuts = Shortcuts { keep, ..shortcuts };

@@ -16,7 +16,6 @@ use std::sync::Arc;
 use storm_model::Kept;
 use storm_render::Intrinsics;
 
-use crate::rigid::Rigid;
 use crate::source::Frame;
 use crate::sync::clock::seconds_between;
 use crate::window::Window;
@@ -51,10 +50,9 @@ impl Left {
 
     /// The next window in this frame, on its clock.
     pub fn placed(&self, next: &Window<Frame>) -> Window<Frame> {
-        let map_from_anchor: Rigid = self.window.map_from_anchor;
         let lead_sec = self.lead_sec(next);
         let time_sec = next.time_sec.iter().map(|row| row.iter().map(|t| t + lead_sec).collect()).collect();
-        Window { map_from_anchor, time_sec, ..next.clone() }
+        Window { map_from_anchor: self.window.map_from_anchor, time_sec, ..next.clone() }
     }
 
     /// How long this frame's clock had run at the window's first timestep, seconds.
