@@ -178,6 +178,16 @@ impl FlowEvaluation {
         Ok(())
     }
 
+    /// Counts what the other counted too.
+    pub fn join(&mut self, other: &Self) {
+        self.epe3d.join(&other.epe3d);
+        self.acc5.join(&other.acc5);
+        self.acc10.join(&other.acc10);
+        self.outliers.join(&other.outliers);
+        self.theta.join(&other.theta);
+        self.rmse.join(&other.rmse);
+    }
+
     /// The means so far.
     pub fn means(&self) -> FlowMeans {
         FlowMeans {

@@ -50,6 +50,12 @@ impl Mean {
         }
     }
 
+    /// Counts what the other counted too.
+    pub fn join(&mut self, other: &Self) {
+        self.sum += other.sum;
+        self.count += other.count;
+    }
+
     /// The mean, or `None` of nothing.
     pub fn value(&self) -> Option<f64> {
         (self.count > 0).then(|| self.sum / self.count as f64)

@@ -127,6 +127,8 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let weights = evaluation.engine().weights().to_string();
     let figures = evaluation.figures();
     let named: Vec<(&str, _)> = figures.iter().map(|(method, figures)| (method.name(), figures)).collect();
+    let errors = evaluation.standard_errors();
+    let spread = errors.first().map(|(_, errors)| errors);
     if weights == UNTRAINED {
         complain!("weights: untrained. Seeded random weights stand in; the network's figures mean nothing");
     }
@@ -137,9 +139,9 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         size.0,
         size.1
     );
-    say_text!("{}", table::text(&named));
+    say_text!("{}", table::text(&named, spread));
     if let Some(path) = &args.markdown {
-        write(path, &table::markdown(&named))?;
+        write(path, &table::markdown(&named, spread))?;
     }
     if let Some(path) = &args.json {
         let mut report = json!({
@@ -152,6 +154,9 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         data.note(&mut report);
         for (name, figures) in &named {
             report[*name] = serde_json::to_value(figures)?;
+        }
+        for (method, errors) in &errors {
+            report["standard_errors"][method.name()] = serde_json::to_value(errors)?;
         }
         write(path, &(serde_json::to_string_pretty(&report)? + "\n"))?;
     }

@@ -72,6 +72,31 @@ impl Figures {
         ]
     }
 
+    /// Each, in the order of [`Self::rows`].
+    pub(super) fn values_mut(&mut self) -> [&mut Option<f64>; 19] {
+        [
+            &mut self.psnr,
+            &mut self.psnr_dynamic,
+            &mut self.ssim,
+            &mut self.ssim_dynamic,
+            &mut self.depth_rmse,
+            &mut self.depth_rmse_dynamic,
+            &mut self.depth_rmse_lidar,
+            &mut self.epe3d,
+            &mut self.acc5,
+            &mut self.acc10,
+            &mut self.theta,
+            &mut self.epe3d_three_way,
+            &mut self.epe3d_foreground_dynamic,
+            &mut self.epe3d_foreground_static,
+            &mut self.epe3d_background_static,
+            &mut self.fg_ari,
+            &mut self.moving_iou,
+            &mut self.apd3d,
+            &mut self.ms,
+        ]
+    }
+
     /// Means over images, without sky where the sky is known.
     pub(super) fn of_images(scores: &[ImageScores]) -> Self {
         let m = ImageScores::mean(scores);
@@ -84,6 +109,22 @@ impl Figures {
             depth_rmse_dynamic: m.depth_rmse_dynamic,
             depth_rmse_lidar: m.depth_rmse_lidar,
             ..Self::default()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_and_values_are_in_one_order() {
+        let mut figures = Figures::default();
+        for (k, value) in figures.values_mut().into_iter().enumerate() {
+            *value = Some(k as f64);
+        }
+        for (k, (name, _, value)) in figures.rows().into_iter().enumerate() {
+            assert_eq!(value, Some(k as f64), "{name}");
         }
     }
 }

@@ -76,7 +76,7 @@ pub(super) struct DriveRow {
     /// Mean milliseconds per step, all computed in full and with the ladder.
     pub full_ms: f64,
     pub ms: f64,
-    /// How many times less.
+    /// How many times less; of `mixed` their mean, weighted by steps, as if a full step took equally long in all three.
     pub ratio: f64,
     /// Median milliseconds of a step that was taken again, and of one that was predicted.
     pub still_ms: Option<f64>,
@@ -143,6 +143,9 @@ fn mixed(rows: &[DriveRow]) -> DriveRow {
         rows.iter().map(|r| get(r) * r.steps as f64).sum::<f64>() / steps.max(1) as f64
     };
     let (full_ms, ms) = (mean(&|r| r.full_ms), mean(&|r| r.ms));
+    // Not the quotient of those: the three were driven one after the other, and the machine may have been slow during one. Each
+    // one's own ratio is of steps in turn, so that a full step counts alike in all.
+    let ratio = steps as f64 / rows.iter().map(|r| r.steps as f64 / r.ratio).sum::<f64>();
     DriveRow {
         drive: "mixed",
         steps,
@@ -151,7 +154,7 @@ fn mixed(rows: &[DriveRow]) -> DriveRow {
         approximate: sum(&|r| r.approximate),
         full_ms,
         ms,
-        ratio: full_ms / ms,
+        ratio,
         still_ms: None,
         predicted_ms: None,
         full: None,

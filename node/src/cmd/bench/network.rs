@@ -28,7 +28,7 @@ const SEED: u64 = 424_242;
 /// From this width on a step takes a minute of processor time: few runs, no warm-up.
 const LARGE: usize = 768;
 /// Runs of those.
-const RUNS_OF_LARGE: usize = 2;
+const RUNS_OF_LARGE: usize = 3;
 /// Short steps are run for this long, up to so many times.
 const SHORT: (f64, usize) = (24.0, 25);
 
@@ -53,7 +53,7 @@ pub(in crate::cmd) struct Setting {
     pub picture: [usize; 2],
     pub clips: usize,
     pub step_ms: StageStats,
-    /// How many times longer the default's step takes, run in turn with this one's, by the lower quartiles.
+    /// How many times longer the default's step takes, run in turn with this one's: see [`Pairs`].
     pub times_less: Option<f64>,
     /// Those turns: this setting's steps and the default's.
     pub turns_ms: Pairs,

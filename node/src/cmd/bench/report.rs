@@ -95,8 +95,8 @@ impl Report {
     fn settings_table(&self) -> String {
         let mut text = String::from(
             "## Settings\n\nFull steps: the network, then the newest pictures drawn with flow and motion groups. `times less`: each \
-             setting's steps are run in turn with the default's, and this is how many times longer those take by the lower \
-             quartiles: it repeats where the times, which whatever else the machine does lengthens, do not. Networks with weights are \
+             setting's steps are run in turn with the default's, and this is how many times longer those take in the \
+             faster half of the turns: it repeats where the times, which whatever else the machine does lengthens, do not. Networks with weights are \
              scored on held-out drives against the truth by `storm eval`'s protocol (more timesteps left out: more pictures held \
              out); those without against their own exact f32 result. FLOPs are counted, not measured.\n\n",
         );
@@ -179,7 +179,8 @@ impl Report {
         let mut text = String::from(
             "## Skipping\n\n`tiny` over drives at 10 Hz, everything asked for (map, trajectories, objects, pictures): mean time per step with \
              every step computed and with the setting's ladder, on the same windows. Errors are of scenes against the truth, full \
-             and with the ladder. `mixed` is all of them one after the other.\n\n",
+             and with the ladder. `mixed` is all of them one after the other; its `times less` is the mean of the three, each step counted \
+             alike.\n\n",
         );
         text += &head(&[
             "setting",

@@ -17,7 +17,7 @@ use crate::window::WindowBuilder;
 
 const SEED: u64 = 424_242;
 /// Runs of one point, each beside one of the usual size; where they take long, fewer.
-const TURNS: Turns = Turns { least: 3, most: 15, seconds: 10.0 };
+const TURNS: Turns = Turns { least: 6, most: 15, seconds: 10.0 };
 /// The usual size.
 const USUAL: WindowSize = WindowSize { timesteps: 4, cameras: 3, width: 96, height: 64 };
 

@@ -12,6 +12,7 @@ mod nsfp;
 mod oracle;
 mod per_frame;
 mod prediction;
+mod spread;
 mod tally;
 #[cfg(test)]
 mod tests;
@@ -57,14 +58,15 @@ pub struct Evaluation {
     engine: Engine,
     per_frame: Option<Engine>,
     effort: Effort,
-    tallies: Vec<(Method, Tally)>,
+    /// Of every method a tally per clip.
+    tallies: Vec<(Method, Vec<Tally>)>,
     warm: bool,
 }
 
 impl Evaluation {
     /// Of `methods` on `engine`'s network; `per_frame` is a network of its own for the per-frame setting.
     pub fn new(engine: Engine, per_frame: Option<Engine>, methods: &[Method], effort: Effort) -> Self {
-        let tallies = methods.iter().map(|&m| (m, Tally::default())).collect();
+        let tallies = methods.iter().map(|&m| (m, Vec::new())).collect();
         Self { engine, per_frame, effort, tallies, warm: false }
     }
 
@@ -85,7 +87,7 @@ impl Evaluation {
             *warm = true;
         }
         let (scene, scene_ms) = timed(|| engine.step(&clip.window, &clip.cameras))?;
-        for (method, tally) in tallies {
+        for (method, tallies) in tallies {
             let method = *method;
             say(method, None);
             let (prediction, ms) = timed(|| {
@@ -101,7 +103,9 @@ impl Evaluation {
                 Method::ConstantVelocity | Method::OracleGeometry | Method::NearestContext => None,
             };
             if let Some(prediction) = prediction {
+                let mut tally = Tally::default();
                 tally.add(clip, &prediction, ms).with_context(|| format!("{}, {}", clip.name, method.name()))?;
+                tallies.push(tally);
             }
         }
         Ok(())
@@ -109,12 +113,17 @@ impl Evaluation {
 
     /// Every method's means over everything scored, in the order asked for.
     pub fn figures(&self) -> Vec<(Method, Figures)> {
-        self.tallies.iter().map(|(method, tally)| (*method, tally.figures())).collect()
+        self.tallies.iter().map(|(method, clips)| (*method, spread::whole(clips).figures())).collect()
+    }
+
+    /// The standard errors of [`Self::figures`] over the clips: how far other clips of the same kind would put them.
+    pub fn standard_errors(&self) -> Vec<(Method, Figures)> {
+        self.tallies.iter().map(|(method, clips)| (*method, spread::standard_errors(clips))).collect()
     }
 
     /// Held-out pictures scored (by whichever method scored most).
     pub fn images(&self) -> usize {
-        self.tallies.iter().map(|(_, tally)| tally.images()).max().unwrap_or(0)
+        self.tallies.iter().map(|(_, clips)| clips.iter().map(Tally::images).sum()).max().unwrap_or(0)
     }
 }
 

@@ -75,6 +75,17 @@ impl Tally {
         }
     }
 
+    /// Counts what the other counted too.
+    pub fn join(&mut self, other: &Self) {
+        self.images.extend_from_slice(&other.images);
+        self.flow.join(&other.flow);
+        self.three_way.iter_mut().zip(&other.three_way).for_each(|(mean, other)| mean.join(other));
+        self.ari.join(&other.ari);
+        self.moving_iou.join(&other.moving_iou);
+        self.apd3d.join(&other.apd3d);
+        self.ms.join(&other.ms);
+    }
+
     /// Held-out pictures scored.
     pub fn images(&self) -> usize {
         self.images.len()
