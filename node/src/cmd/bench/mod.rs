@@ -148,10 +148,10 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         };
         let data = Data::held_out(&base, clips, bag)?;
         let mut references = References::new();
-        for (nth, row) in network_rows.iter().filter(|row| row.large || model != LARGEST).enumerate() {
-            // The peer before and after the first row of its size, so that a slow while of the machine is in both.
-            let peer = args.peer_python.as_ref().filter(|_| nth == 0 && model == LARGEST);
-            time_peer(peer, &mut report, &bar)?;
+        // The peer before and after the rows of its size, so that a slow while of the machine is in both.
+        let peer = args.peer_python.as_ref().filter(|_| model == LARGEST);
+        time_peer(peer, &mut report, &bar)?;
+        for row in network_rows.iter().filter(|row| row.large || model != LARGEST) {
             bar.set_message(format!("{model}, {}", row.name));
             let config = row.config(model)?;
             let beside = (config != base).then_some(&base);
@@ -178,8 +178,8 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             });
             report.settings.push(s);
             bar.inc(1);
-            time_peer(peer, &mut report, &bar)?;
         }
+        time_peer(peer, &mut report, &bar)?;
         if trained {
             bar.set_message("other methods");
             let figures = peers::baselines(&data, &args.methods, &mut || bar.inc(1))?;

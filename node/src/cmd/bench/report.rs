@@ -5,6 +5,7 @@ use serde_json::Value;
 
 use super::drives::Drives;
 use super::network::Setting;
+use super::pairs::median;
 use super::sizes::{Point, rate};
 use crate::engine::figures::Figures;
 use crate::output::plot::{self, Axis, Drawn, Panel, Series};
@@ -149,10 +150,14 @@ impl Report {
         text + "\n"
     }
 
-    /// How many times longer the largest network's default takes than the peer.
+    /// How many times longer the largest network's default takes than the peer, by the medians: its steps of all rows, for the peer
+    /// was timed before the first and after the last of them.
     pub fn peer_times_less(&self) -> Option<f64> {
-        let largest = self.settings.iter().find(|s| s.model == super::LARGEST && s.times_less.is_none())?;
-        Some(largest.stages_ms.get("network")?.p50 / 1e3 / self.peer_pytorch.as_ref()?["median_s"].as_f64()?)
+        let of_largest = || self.settings.iter().filter(|s| s.model == super::LARGEST);
+        let own = of_largest().filter(|s| s.times_less.is_none()).flat_map(|s| &s.turns_ms.one);
+        let beside = of_largest().flat_map(|s| &s.turns_ms.other);
+        let ours = median(own.chain(beside).copied().collect())?;
+        Some(ours / 1e3 / self.peer_pytorch.as_ref()?["median_s"].as_f64()?)
     }
 
     fn baselines_table(&self) -> String {
@@ -390,5 +395,19 @@ mod tests {
         assert!(svg.contains("tiny, int8") && svg.contains("counted FLOPs") && !svg.contains("NaN"), "{svg}");
         assert!(svg.contains("font-weight=\"bold\">1 tiny, default"), "the default is marked: {svg}");
         assert!(!Report::default().picture().contains("NaN"));
+    }
+
+    #[test]
+    fn the_peer_stands_beside_all_steps_of_the_largest_default() {
+        let turns = |one: &[f64], other: &[f64]| Pairs { one: one.to_vec(), other: other.to_vec() };
+        let mut own = Setting { model: "b8".into(), times_less: None, ..setting("default", 1.0, 0.0) };
+        own.turns_ms = turns(&[25e3, 26e3, 24e3], &[]);
+        let mut int8 = Setting { model: "b8".into(), ..setting("int8", 1.0, 0.0) };
+        int8.turns_ms = turns(&[15e3, 15e3], &[21e3, 20e3]);
+        let settings = vec![setting("default", 100.0, 22.5), own, int8];
+        let mut report = Report { settings, ..Report::default() };
+        assert_eq!(report.peer_times_less(), None);
+        report.peer_pytorch = Some(serde_json::json!({"median_s": 30.0}));
+        assert_eq!(report.peer_times_less(), Some(0.8), "24 s, not its own row's 25 s nor int8's 15 s");
     }
 }
