@@ -6,6 +6,7 @@ mod flops;
 mod network;
 mod pairs;
 mod peers;
+mod picture;
 mod report;
 mod settings;
 mod sizes;

@@ -1,8 +1,9 @@
 //! Two things timed in turn, so that what slows the machine for a while slows both: their ratio repeats where their times do not.
 //!
 //! What else the machine does only ever lengthens a run, by a tenth or by half, and not both of a turn alike; and a slow while may
-//! lengthen one of the two by more than the other. So the ratio is of the faster half of the turns: over two benches of this file's
-//! 54 ratios that differs by 2.1 % in the mean, that of the lower quartiles by 2.6 %, of the fastest runs by 2.7 %.
+//! lengthen one of the two by more than the other. So the ratio is of the faster half of the turns: of the 54
+//! ratios of two benches, which chose it, that differed by 2.1 % in the mean, that of the lower quartiles by 2.6 %, of the fastest runs
+//! by 2.7 %.
 
 use std::time::Instant;
 
