@@ -141,8 +141,6 @@ pub fn attention_at(qkv: &Tensor, heads: usize, precision: Precision) -> Result<
     }
     let mut out = vec![0f32; batch * tokens * d3 / 3];
     with_values(qkv, |values| {
-        let rounded = rounded(precision, values);
-        let values = rounded.as_deref().unwrap_or(values);
         let rows = |part: usize| Rows { values, stride: d3, first: part * d3 / 3 };
         let inputs = Inputs { queries: rows(0), keys: rows(1), values: rows(2), count: tokens, bias: None };
         attend(precision, &inputs, shape, &mut out);
@@ -151,14 +149,10 @@ pub fn attention_at(qkv: &Tensor, heads: usize, precision: Precision) -> Result<
     Tensor::from_vec(out, (batch, tokens, d3 / 3), qkv.device())
 }
 
-/// Values rounded to bf16, where that is the precision.
-fn rounded(precision: Precision, values: &[f32]) -> Option<Vec<f32>> {
-    (precision == Precision::Bf16).then(|| values.iter().map(|&x| kernels::math::bf16(x)).collect())
-}
-
 fn attend(precision: Precision, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32]) {
     match precision {
-        Precision::F32 | Precision::Bf16 => kernels::attention::attention_of(Isa::detect(), inputs, shape, out),
+        Precision::F32 => kernels::attention::attention_of(Isa::detect(), inputs, shape, out),
+        Precision::Bf16 => kernels::attention::attention_in_bf16(Isa::detect(), inputs, shape, out),
         Precision::Int16 | Precision::Int8 => kernels::attention::attention_in_pairs(Isa::detect(), inputs, shape, out),
     }
 }
@@ -192,9 +186,7 @@ pub fn cross_attention(
     let shape = Shape { batch, tokens, heads, head_dim: d / heads };
     let bias: Option<Vec<f32>> = sizes.map(|sizes| sizes.iter().map(|s| s.log2()).collect());
     let mut out = vec![0f32; queries.elem_count()];
-    with_all(inputs, |[queries, keys_values]| {
-        let (q, kv) = (rounded(precision, queries), rounded(precision, keys_values));
-        let (queries, kv) = (q.as_deref().unwrap_or(queries), kv.as_deref().unwrap_or(keys_values));
+    with_all(inputs, |[queries, kv]| {
         let half = |first: usize| Rows { values: kv, stride: d2, first };
         let queries = Rows { values: queries, stride: d, first: 0 };
         let inputs = Inputs { queries, keys: half(0), values: half(d), count, bias: bias.as_deref() };

@@ -129,7 +129,7 @@ pub fn chain(isa: Isa, x: &[f32], width: usize, steps: &[Step<'_>], residual: Op
         largest = largest.max(count / from * to);
         count / from * to
     });
-    let tile = isa.tile_rows();
+    let tile = isa.row_step();
     let count = x.len() / width;
     let share = gemm::task_rows(isa, count).min(TASK_ROWS);
     let rows = share.min(TASK_FLOATS / largest / tile * tile).max(tile);

@@ -1,9 +1,10 @@
 //! Fast f32 CPU kernels behind the network's operations: tiled attention, linear layers with fused epilogues, layer
 //! norm, row softmax.
 //!
-//! One source, three compilations: every kernel is one generic body over `simd::Simd`, compiled for AVX2+FMA, for
-//! AVX-512 and for the target's baseline, and picked at run time by [`Isa::detect`]. The AVX2 vectors are intrinsics;
-//! the other two are plain arrays the compiler turns into vectors.
+//! One source, several compilations: every kernel is one generic body over `simd::Simd`, compiled for AVX2+FMA, for
+//! AVX-512 (with and without VNNI) and for the target's baseline, and picked at run time by [`Isa::detect`]. The baseline's
+//! vectors are plain arrays the compiler turns into registers, the others intrinsics. Products of matrices have a version of
+//! their own for AMX tile units (`amx`).
 //!
 //! Every sum is taken in an order fixed by the shapes and the instruction set alone, so results have the same bits for
 //! any number of threads. Between instruction sets they differ by rounding.
@@ -11,6 +12,8 @@
 //! Backward passes take what the forward pass kept; [`crate::ops`] puts both into candle's gradient graph.
 
 mod aligned;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+mod amx;
 pub mod arrange;
 pub mod attention;
 pub mod chain;
@@ -32,8 +35,10 @@ pub enum Isa {
     Portable,
     /// x86-64 with AVX2 and FMA.
     Avx2,
-    /// x86-64 with AVX-512F.
+    /// x86-64 with AVX-512 (F, BW, DQ, VL).
     Avx512,
+    /// The same with AMX tile units, for products; everything else is AVX-512's.
+    Amx,
 }
 
 impl Isa {
@@ -50,8 +55,12 @@ impl Isa {
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
             sets.push(Isa::Avx2);
-            if is_x86_feature_detected!("avx512f") {
+            if simd::has_avx512() {
                 sets.push(Isa::Avx512);
+                #[cfg(target_os = "linux")]
+                if amx::available() {
+                    sets.push(Isa::Amx);
+                }
             }
         }
         sets
@@ -73,7 +82,7 @@ impl Isa {
         match self {
             Isa::Portable => 4,
             Isa::Avx2 => 8,
-            Isa::Avx512 => 16,
+            Isa::Avx512 | Isa::Amx => 16,
         }
     }
 
@@ -82,8 +91,21 @@ impl Isa {
     pub(crate) fn tile_rows(self) -> usize {
         match self {
             Isa::Portable | Isa::Avx2 => 6,
-            Isa::Avx512 => 12,
+            Isa::Avx512 | Isa::Amx => 12,
         }
+    }
+
+    /// Rows that tasks come in multiples of.
+    pub(crate) fn row_step(self) -> usize {
+        match self {
+            Isa::Amx => 32,
+            _ => self.tile_rows(),
+        }
+    }
+
+    /// The set that products of pairs of 16-bit whole numbers run on: tile units have none.
+    pub(crate) fn for_pairs(self) -> Self {
+        if self == Isa::Amx { Isa::Avx512 } else { self }
     }
 
     /// Columns of a register tile.
@@ -117,8 +139,9 @@ pub(crate) mod tests {
 
     #[test]
     fn tiles_divide_the_blocks() {
-        for isa in [Isa::Portable, Isa::Avx2, Isa::Avx512] {
+        for isa in [Isa::Portable, Isa::Avx2, Isa::Avx512, Isa::Amx] {
             assert_eq!(96 % isa.tile_rows(), 0);
+            assert_eq!(96 % isa.row_step(), 0);
             assert!(isa.panel_depth() * isa.tile_cols() <= 4096);
         }
     }

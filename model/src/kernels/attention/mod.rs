@@ -14,6 +14,8 @@
 mod backward;
 mod pack;
 mod pairs;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+mod tiles;
 
 use std::cell::RefCell;
 
@@ -21,8 +23,10 @@ use rayon::prelude::*;
 
 use super::Isa;
 use super::aligned::Aligned;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+use super::amx::Parts;
 use super::gemm::tile;
-use super::math::{exp2, exp2_short};
+use super::math::{bf16, exp2, exp2_short};
 use super::simd::{Kernel, Simd, dispatch};
 use pack::{Layout, Sizes, Source, pack};
 
@@ -366,6 +370,32 @@ pub fn attention_keeping(isa: Isa, qkv: &[f32], shape: Shape, out: &mut [f32]) -
     log_sums
 }
 
+/// As [`attention_of`], operands rounded to bf16 (weights of the softmax only where tile units take the product).
+///
+/// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
+pub fn attention_in_bf16(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32]) {
+    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+    if isa == Isa::Amx {
+        inputs.check(&shape);
+        assert_eq!(out.len(), shape.batch * shape.tokens * shape.width(), "output of {shape:?}");
+        assert!(inputs.count > 0 || out.is_empty(), "no keys");
+        if !out.is_empty() {
+            tiles::run(Parts::One, inputs, shape, out, None);
+        }
+        return;
+    }
+    let rounded = |rows: &Rows<'_>| rows.values.iter().map(|&x| bf16(x)).collect::<Vec<f32>>();
+    let [queries, keys, values] = [&inputs.queries, &inputs.keys, &inputs.values].map(rounded);
+    let with = |rows: Rows<'_>, values| Rows { values, ..rows };
+    let inputs = Inputs {
+        queries: with(inputs.queries, &queries),
+        keys: with(inputs.keys, &keys),
+        values: with(inputs.values, &values),
+        ..*inputs
+    };
+    attention_of(isa, &inputs, shape, out);
+}
+
 /// The bias in whole blocks, and its largest size (NaN where it holds one).
 fn whole_blocks(inputs: &Inputs<'_>) -> Option<(Vec<f32>, f32)> {
     let bias = inputs.bias?;
@@ -382,6 +412,10 @@ fn run(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32], log_sums: O
         return;
     }
     assert!(inputs.count > 0, "no keys");
+    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+    if isa == Isa::Amx {
+        return tiles::run(Parts::Three, inputs, shape, out, log_sums);
+    }
     let bias = whole_blocks(inputs);
     let bias = bias.as_ref().map(|(bias, largest)| (&bias[..], *largest));
     let layout = Layout::new(isa, shape.head_dim, inputs.count);

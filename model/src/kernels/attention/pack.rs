@@ -135,7 +135,7 @@ pub(super) fn larger(a: f32, b: f32) -> f32 {
 
 /// Sum of squares over eight interleaved partial sums.
 #[inline(always)]
-fn squares(x: &[f32]) -> f32 {
+pub(super) fn squares(x: &[f32]) -> f32 {
     let mut partial = [0f32; 8];
     let mut chunks = x.chunks_exact(8);
     for chunk in &mut chunks {

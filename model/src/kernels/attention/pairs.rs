@@ -290,12 +290,11 @@ fn quantised_weights<S: Simd>(logits: &[f32], offset: f32, tiles: usize, weights
     S::sum(S::whole_to_float(sum))
 }
 
-/// [`super::attention_of`] in whole numbers. AVX-512 machines run the AVX2 kernel: wider products of pairs would be code that
-/// nobody has run.
+/// [`super::attention_of`] in whole numbers.
 ///
 /// Panics when the lengths disagree (callers take them from tensor shapes) or the machine lacks `isa`.
 pub fn attention_in_pairs(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32]) {
-    let isa = if isa == Isa::Avx512 { Isa::Avx2 } else { isa };
+    let isa = isa.for_pairs();
     inputs.check(&shape);
     assert_eq!(out.len(), shape.batch * shape.tokens * shape.width(), "output of {shape:?}");
     if out.is_empty() {

@@ -13,6 +13,8 @@ mod backward;
 pub(crate) mod integer;
 mod pack;
 mod tile;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+mod tiles;
 
 use std::cell::RefCell;
 
@@ -103,6 +105,8 @@ impl Kernel for Block<'_> {
                 self.run_in::<S, MR, Pairs>(scales)
             }
             Numbers::Floats | Numbers::Rounded => self.run_in::<S, MR, Floats>(None),
+            #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+            Numbers::Tiles(parts) => self.run_tiles::<S>(*parts),
         }
     }
 }
@@ -243,7 +247,7 @@ fn check(x: &[f32], w: &PackedWeight, epilogue: &Epilogue<'_>, m: usize, out: us
 
 /// Rows of a task: few enough that every thread gets several, at most a block.
 pub(super) fn task_rows(isa: Isa, m: usize) -> usize {
-    m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(isa.tile_rows()).min(BLOCK_ROWS)
+    m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(isa.row_step()).min(BLOCK_ROWS)
 }
 
 impl<'a> Epilogue<'a> {

@@ -5,6 +5,8 @@ use rayon::prelude::*;
 use super::integer::{self, IntegerScales};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+use crate::kernels::amx::Parts;
 use crate::kernels::math::bf16;
 use crate::ops::Precision;
 
@@ -39,9 +41,12 @@ pub(super) enum Numbers {
     Rounded,
     /// Pairs of 16-bit whole numbers, see [`super::integer`].
     Pairs(IntegerScales),
+    /// Tiles of bf16, see [`crate::kernels::amx`].
+    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+    Tiles(Parts),
 }
 
-/// A weight `(n, k)` laid out as the kernel reads it: per panel of `tile_cols` outputs, `k` rows of that many floats (or
+/// A weight `(n, k)` laid out as the kernel reads it (on tile units: [`crate::kernels::amx`]); elsewhere per panel of `tile_cols` outputs, `k` rows of that many floats (or
 /// half as many rows of pairs of whole numbers), zeros past `n`.
 #[derive(Debug)]
 pub struct PackedWeight {
@@ -56,6 +61,10 @@ impl PackedWeight {
     /// Packs a row-major `(n, k)` weight, `k > 0`.
     pub fn new(isa: Isa, weight: &[f32], n: usize, k: usize) -> Self {
         assert!(k > 0 && weight.len() == n * k, "weight of {n} x {k}");
+        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+        if isa == Isa::Amx {
+            return Self::tiles(Parts::Three, weight, n, k);
+        }
         let nr = isa.tile_cols();
         let mut data = Aligned::zeroed(n.div_ceil(nr) * nr * k);
         data.as_mut_slice().par_chunks_mut(nr * k).zip(weight.par_chunks(nr * k)).for_each(|(panel, rows)| {
@@ -72,6 +81,8 @@ impl PackedWeight {
     pub fn in_precision(isa: Isa, precision: Precision, weight: &[f32], n: usize, k: usize) -> Self {
         match precision {
             Precision::F32 => Self::new(isa, weight, n, k),
+            #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+            Precision::Bf16 if isa == Isa::Amx => Self::tiles(Parts::One, weight, n, k),
             Precision::Bf16 => {
                 let mut packed = Self::new(isa, weight, n, k);
                 packed.data.as_mut_slice().iter_mut().for_each(|x| *x = bf16(*x));
@@ -82,11 +93,10 @@ impl PackedWeight {
         }
     }
 
-    /// With weights in whole numbers up to `largest`. AVX-512 machines run the AVX2 kernel: wider products of pairs would
-    /// be code that nobody has run.
+    /// With weights in whole numbers up to `largest`.
     fn whole(isa: Isa, weight: &[f32], n: usize, k: usize, largest: f32) -> Self {
         assert!(k > 0 && weight.len() == n * k, "weight of {n} x {k}");
-        let isa = if isa == Isa::Avx512 { Isa::Avx2 } else { isa };
+        let isa = isa.for_pairs();
         let nr = isa.tile_cols();
         let pairs = k.div_ceil(2);
         let mut data = Aligned::zeroed(n.div_ceil(nr) * nr * pairs);
@@ -115,6 +125,10 @@ impl PackedWeight {
     /// [`PackedWeight::transposed`] into the memory of an earlier one.
     pub(super) fn pack_transposed(&mut self, values: &[f32], n: usize, k: usize) {
         assert!(k > 0 && values.len() == n * k, "weight of {k} x {n}");
+        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+        if self.isa == Isa::Amx {
+            return self.pack_tiles_transposed(Parts::Three, values, n, k);
+        }
         let nr = self.isa.tile_cols();
         (self.n, self.k) = (n, k);
         let panels = self.data.at_least(n.div_ceil(nr) * nr * k);

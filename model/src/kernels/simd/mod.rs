@@ -1,9 +1,16 @@
-//! Vectors of `f32` for kernels written once: a trait, its AVX2 and array versions, and the run-time choice.
+//! Vectors of `f32` for kernels written once: a trait, its AVX2, AVX-512 and array versions, and the run-time choice.
 //!
 //! The vector types are private: kernels only ever see `S: Simd`, and only [`dispatch`] names an implementation, after
-//! the instruction set was detected. That is what makes the safe methods of the AVX2 version sound.
+//! the instruction set was detected. That is what makes the safe methods of the AVX versions sound.
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
 
 use super::Isa;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+pub(super) use avx512::Avx512;
 
 /// A vector of `W` floats. Every method is a few instructions and inlined into a function compiled for the set.
 pub(crate) trait Simd: Copy + 'static {
@@ -182,115 +189,6 @@ impl<const W: usize, const FMA: bool> Simd for Lanes<W, FMA> {
     }
 }
 
-#[cfg(target_arch = "x86_64")]
-mod avx2 {
-    use std::arch::x86_64::*;
-
-    /// AVX2 and FMA registers.
-    #[derive(Clone, Copy)]
-    pub(super) struct Avx2;
-
-    // SAFETY (every block in this impl): the type is only named by `dispatch` under `Isa::Avx2`, which exists only
-    // after the features were detected, and every method is inlined into `run_avx2`.
-    impl super::Simd for Avx2 {
-        type V = __m256;
-        const W: usize = 8;
-
-        #[inline(always)]
-        fn splat(x: f32) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_set1_ps(x) }
-        }
-        #[inline(always)]
-        unsafe fn load(p: *const f32) -> __m256 {
-            // SAFETY: AVX2 was detected; the caller gives 8 readable floats.
-            unsafe { _mm256_loadu_ps(p) }
-        }
-        #[inline(always)]
-        unsafe fn store(p: *mut f32, v: __m256) {
-            // SAFETY: AVX2 was detected; the caller gives 8 writable floats.
-            unsafe { _mm256_storeu_ps(p, v) }
-        }
-        #[inline(always)]
-        fn add(a: __m256, b: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_add_ps(a, b) }
-        }
-        #[inline(always)]
-        fn sub(a: __m256, b: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_sub_ps(a, b) }
-        }
-        #[inline(always)]
-        fn mul(a: __m256, b: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_mul_ps(a, b) }
-        }
-        #[inline(always)]
-        fn div(a: __m256, b: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_div_ps(a, b) }
-        }
-        #[inline(always)]
-        fn mul_add(a: __m256, b: __m256, c: __m256) -> __m256 {
-            // SAFETY: FMA was detected (see the impl).
-            unsafe { _mm256_fmadd_ps(a, b, c) }
-        }
-        #[inline(always)]
-        fn max_of(floor: __m256, x: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected. maxps gives its second operand when either is NaN.
-            unsafe { _mm256_max_ps(floor, x) }
-        }
-        #[inline(always)]
-        fn abs(a: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), a) }
-        }
-        #[inline(always)]
-        fn select_lt(a: __m256, b: __m256, x: __m256, y: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_blendv_ps(y, x, _mm256_cmp_ps::<_CMP_LT_OQ>(a, b)) }
-        }
-        #[inline(always)]
-        fn exponent(t: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe {
-                let n = _mm256_add_epi32(_mm256_castps_si256(t), _mm256_set1_epi32(127));
-                _mm256_castsi256_ps(_mm256_slli_epi32::<23>(n))
-            }
-        }
-        #[inline(always)]
-        fn scale(p: __m256, t: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe {
-                let n = _mm256_slli_epi32::<23>(_mm256_castps_si256(t));
-                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), n))
-            }
-        }
-        #[inline(always)]
-        fn mul_add_pairs(a: __m256, b: __m256, c: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe {
-                let sums = _mm256_madd_epi16(_mm256_castps_si256(a), _mm256_castps_si256(b));
-                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(c), sums))
-            }
-        }
-        #[inline(always)]
-        fn whole_to_float(a: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe { _mm256_cvtepi32_ps(_mm256_castps_si256(a)) }
-        }
-        #[inline(always)]
-        fn pair(low: __m256, high: __m256) -> __m256 {
-            // SAFETY: AVX2 was detected (see the impl).
-            unsafe {
-                let high = _mm256_slli_epi32::<16>(_mm256_castps_si256(high));
-                _mm256_castsi256_ps(_mm256_blend_epi16::<0xaa>(_mm256_castps_si256(low), high))
-            }
-        }
-    }
-}
-
 /// Work written once: `run` must be `#[inline(always)]`, so that it is compiled inside the function that enables the
 /// instruction set. `MR` is [`Isa::tile_rows`].
 pub(crate) trait Kernel {
@@ -308,9 +206,13 @@ pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Out {
             // SAFETY: both features were just detected.
             return unsafe { run_avx2(kernel) };
         }
-        if isa == Isa::Avx512 && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("fma") {
-            // SAFETY: both features were just detected.
-            return unsafe { run_avx512(kernel) };
+        if matches!(isa, Isa::Avx512 | Isa::Amx) && has_avx512() {
+            return match is_x86_feature_detected!("avx512vnni") {
+                // SAFETY: all features were just detected.
+                true => unsafe { run_avx512_vnni(kernel) },
+                // SAFETY: all features were just detected.
+                false => unsafe { run_avx512(kernel) },
+            };
         }
     }
     #[cfg(all(test, target_arch = "x86_64"))]
@@ -328,10 +230,26 @@ fn run_avx2<K: Kernel>(kernel: K) -> K::Out {
     kernel.run::<avx2::Avx2, 6>()
 }
 
+/// Whether the machine has what [`Isa::Avx512`] stands for: what all processors with AVX-512 since 2017 have.
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx2,fma")]
+pub(super) fn has_avx512() -> bool {
+    is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512dq")
+        && is_x86_feature_detected!("avx512vl")
+        && is_x86_feature_detected!("fma")
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx2,fma")]
 fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
-    kernel.run::<Lanes<16, true>, 12>()
+    kernel.run::<avx512::Avx512<false>, 12>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vnni,avx2,fma")]
+fn run_avx512_vnni<K: Kernel>(kernel: K) -> K::Out {
+    kernel.run::<avx512::Avx512<true>, 12>()
 }
 
 /// The AVX-512 build's vectors and tiles on AVX2 registers: what a machine without AVX-512 can test of it.

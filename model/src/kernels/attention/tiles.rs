@@ -1,0 +1,333 @@
+//! Attention on AMX tile units: blocks of queries against blocks of keys as in [`super`], 32 queries at a time, both products
+//! from [`crate::kernels::amx`], the softmax between them on vectors in f32. Weights go from the vectors' registers
+//! to the left-hand tiles of the second product; keys and values are packed once per head.
+
+use std::arch::x86_64::{_mm512_mask_mov_ps, _mm512_maskz_mov_ps, _mm512_storeu_si512};
+use std::cell::RefCell;
+
+use rayon::prelude::*;
+
+use super::pack::{Inputs, Shape, Sizes, Source, larger, logit_scale, squares};
+use super::{BLOCK_KEYS, FLAT_LOGITS, FLAT_VALUES, Output, PACKED, whole_blocks};
+use crate::kernels::aligned::Aligned;
+use crate::kernels::amx::{
+    Configured, Parts, SIDE, STEP, TILE, TILE_FLOATS, column_tiles, product, product_onto, row_tiles, transpose, words_of,
+};
+use crate::kernels::math::{exp2, exp2_short};
+use crate::kernels::simd::{Avx512, Simd};
+
+/// Queries of a task: keys and values are fetched from the third-level cache once for all of them.
+const BLOCK_QUERIES: usize = 192;
+
+type V = Avx512<true>;
+
+/// Working memory of a task, kept by its thread.
+#[derive(Default)]
+struct Scratch {
+    queries: Aligned,
+    logits: Aligned,
+    weights: Aligned,
+    sums: Aligned,
+    totals: Aligned,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// How one head's packed blocks lie: panels of 32 keys, then panels of 32 channels of values.
+#[derive(Clone, Copy)]
+struct Layout {
+    parts: Parts,
+    head_dim: usize,
+    /// Of a panel of keys.
+    key_floats: usize,
+    /// Of a panel of values.
+    value_floats: usize,
+    block_floats: usize,
+    blocks: usize,
+}
+
+impl Layout {
+    fn new(parts: Parts, head_dim: usize, count: usize) -> Self {
+        let room = BLOCK_KEYS.min(count.next_multiple_of(SIDE));
+        let (key_floats, value_floats) = (parts.panel_floats(head_dim), parts.panel_floats(room));
+        let block_floats = room / SIDE * key_floats + head_dim.div_ceil(SIDE) * value_floats;
+        Self { parts, head_dim, key_floats, value_floats, block_floats, blocks: count.div_ceil(BLOCK_KEYS) }
+    }
+
+    /// A block's panels of keys, and of values.
+    fn split<'a>(&self, block: &'a [f32]) -> (&'a [f32], &'a [f32]) {
+        block.split_at(block.len() - self.head_dim.div_ceil(SIDE) * self.value_floats)
+    }
+}
+
+/// Packs the keys and values of one block.
+fn pack(inputs: &Inputs<'_>, shape: &Shape, layout: &Layout, index: usize, block: &mut [f32]) -> Sizes {
+    let (head_index, first) = (index / layout.blocks, index % layout.blocks * BLOCK_KEYS);
+    let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
+    let (d, parts) = (shape.head_dim, layout.parts);
+    let count = BLOCK_KEYS.min(inputs.count - first);
+    let row = |t: usize| batch * inputs.count + first + t;
+    let values_at = block.len() - d.div_ceil(SIDE) * layout.value_floats;
+    let (keys, values) = block.split_at_mut(values_at);
+    for (panel, to) in keys.chunks_exact_mut(layout.key_floats).enumerate() {
+        for half in 0..2 {
+            let at = panel * SIDE + half * TILE;
+            let key = |r: usize| (at + r < count).then(|| inputs.keys.head(row(at + r), head, d));
+            // SAFETY: `Isa::Amx`, under which alone this runs, exists only where the features were detected.
+            unsafe { row_tiles(parts, half, d, 1.0, key, to) };
+        }
+        // SAFETY: as above.
+        unsafe { transpose(to) };
+    }
+    for (panel, to) in values.chunks_exact_mut(layout.value_floats).enumerate() {
+        for half in 0..2 {
+            let channel = (panel * SIDE + half * TILE).min(d);
+            let value = |t: usize| &inputs.values.head(row(t), head, d)[channel..];
+            // SAFETY: as above.
+            unsafe { column_tiles(parts, half, count, value, to) };
+        }
+    }
+    (0..count).fold(Sizes::default(), |sizes, t| {
+        let (key, value) = (inputs.keys.head(row(t), head, d), inputs.values.head(row(t), head, d));
+        sizes.or(Sizes { key: squares(key), value: squares(value) })
+    })
+}
+
+/// One block of queries of one head, and what it needs.
+struct Task<'a> {
+    source: Source<'a>,
+    layout: &'a Layout,
+    /// Packed blocks of this head.
+    blocks: &'a [f32],
+    sizes: Sizes,
+    /// Added to the logits, for whole blocks of keys; and its largest size.
+    bias: Option<(&'a [f32], f32)>,
+    scratch: &'a mut Scratch,
+    out: Output,
+    log_sums: Option<Output>,
+}
+
+/// Logits of 32 queries and what becomes of them.
+struct Rows<'a> {
+    parts: Parts,
+    /// Rows of `BLOCK_KEYS`.
+    logits: &'a [f32],
+    /// A left-hand panel.
+    weights: &'a mut [f32],
+    /// Rows of so many floats.
+    sums: &'a mut [f32],
+    sums_width: usize,
+    /// A vector a row.
+    totals: &'a mut [f32],
+    /// The largest logit so far, where it is subtracted.
+    largest: Option<&'a mut [f32]>,
+}
+
+impl Rows<'_> {
+    /// Turns the logits of `count` keys into weights.
+    #[inline]
+    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx512vnni,avx2,fma")]
+    fn weigh(&mut self, queries: usize, bias: Option<&[f32]>, count: usize) {
+        let width = count.next_multiple_of(STEP);
+        for r in 0..queries.min(SIDE) {
+            let logits = &self.logits[r * BLOCK_KEYS..][..width];
+            let total = &mut self.totals[r * V::W..][..V::W];
+            // SAFETY: one vector, as just cut.
+            let mut sum = unsafe { V::load(total.as_ptr()) };
+            let mut top = V::zero();
+            if let Some(largest) = &mut self.largest {
+                let before = largest[r];
+                let mut tops = V::splat(before);
+                for (at, one) in logits.chunks_exact(V::W).enumerate() {
+                    // SAFETY: the chunk is a vector, and so is the bias' there.
+                    let logit = unsafe { biased(one, bias, at * V::W) };
+                    let there = first_mask(count.saturating_sub(at * V::W));
+                    tops = _mm512_mask_mov_ps(tops, there, V::max_of(logit, tops));
+                }
+                largest[r] = V::largest(tops);
+                top = V::splat(largest[r]);
+                let shrink = exp2::<V>(V::splat(before - largest[r]));
+                sum = V::mul(sum, shrink);
+                for part in self.sums[r * self.sums_width..][..self.sums_width].chunks_exact_mut(V::W) {
+                    // SAFETY: the chunk is a vector.
+                    unsafe { V::store(part.as_mut_ptr(), V::mul(shrink, V::load(part.as_ptr()))) };
+                }
+            }
+            let flat = self.largest.is_none();
+            let (half, row) = (r / TILE, r % TILE);
+            let steps = self.weights.chunks_exact_mut(self.parts.step_floats());
+            for (step, (two, to)) in logits.chunks_exact(STEP).zip(steps).enumerate() {
+                // SAFETY: both halves are vectors, and so is the bias' there.
+                let (a, b) = unsafe {
+                    (biased(&two[..TILE], bias, step * STEP), biased(&two[TILE..], bias, step * STEP + TILE))
+                };
+                let (mut low, mut high) = match flat {
+                    true => (exp2_short::<V>(a), exp2_short::<V>(b)),
+                    false => (exp2::<V>(V::sub(a, top)), exp2::<V>(V::sub(b, top))),
+                };
+                let there = count - step * STEP;
+                if there < STEP {
+                    (low, high) = (first_of(low, there), first_of(high, there.saturating_sub(TILE)));
+                }
+                sum = V::add(sum, V::add(low, high));
+                let words = words_of(self.parts, low, high);
+                for (part, words) in words.into_iter().take(self.parts.count()).enumerate() {
+                    let to = &mut to[(2 * part + half) * TILE_FLOATS + row * TILE..][..TILE];
+                    // SAFETY: 16 words, as just cut.
+                    unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), words) };
+                }
+            }
+            // SAFETY: one vector.
+            unsafe { V::store(total.as_mut_ptr(), sum) };
+        }
+    }
+}
+
+/// # Safety
+/// `logits` has a vector, `bias` one at `at`.
+#[inline]
+#[target_feature(enable = "avx512f")]
+unsafe fn biased(logits: &[f32], bias: Option<&[f32]>, at: usize) -> <V as Simd>::V {
+    // SAFETY: the caller's contract.
+    unsafe {
+        let x = V::load(logits.as_ptr());
+        match bias {
+            Some(bias) => V::add(x, V::load(bias[at..].as_ptr())),
+            None => x,
+        }
+    }
+}
+
+/// The first `count` of 16.
+#[inline(always)]
+fn first_mask(count: usize) -> u16 {
+    ((1u32 << count.min(TILE)) - 1) as u16
+}
+
+/// The first `count` values, zeros after them.
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn first_of(x: <V as Simd>::V, count: usize) -> <V as Simd>::V {
+    _mm512_maskz_mov_ps(first_mask(count), x)
+}
+
+impl Task<'_> {
+    #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx512vnni,avx2,fma")]
+    fn run(self) {
+        let Source { inputs, shape, batch, head, first } = self.source;
+        let (layout, parts, d) = (self.layout, self.layout.parts, shape.head_dim);
+        let queries = BLOCK_QUERIES.min(shape.tokens - first);
+        let panels = queries.div_ceil(SIDE);
+        let sums_width = d.next_multiple_of(SIDE);
+        let Scratch { queries: q, logits, weights, sums, totals } = self.scratch;
+        let q = q.at_least(panels * layout.key_floats);
+        let logits = logits.at_least(SIDE * BLOCK_KEYS);
+        let weights = weights.at_least(parts.panel_floats(BLOCK_KEYS));
+        let sums = sums.at_least(panels * SIDE * sums_width);
+        let totals = totals.at_least(panels * SIDE * V::W);
+        sums.fill(0.0);
+        totals.fill(0.0);
+
+        let mut longest = 0f32;
+        for (panel, to) in q.chunks_exact_mut(layout.key_floats).enumerate() {
+            for half in 0..2 {
+                let at = panel * SIDE + half * TILE;
+                let query = |r: usize| (at + r < queries).then(|| self.source.query(at + r));
+                row_tiles(parts, half, d, logit_scale(d), query, to);
+            }
+        }
+        for r in 0..queries {
+            longest = larger(longest, squares(self.source.query(r)));
+        }
+        let longest = longest * logit_scale(d) * logit_scale(d);
+        let room = FLAT_LOGITS - self.bias.map_or(0.0, |(_, largest)| largest);
+        let flat =
+            room >= 0.0 && longest * self.sizes.key <= room * room && self.sizes.value <= FLAT_VALUES * FLAT_VALUES;
+        let mut largest = [f32::MIN; BLOCK_QUERIES];
+
+        let tiles = Configured::new();
+        let (depth, channels) = (d.div_ceil(STEP), d.div_ceil(SIDE));
+        for (index, block) in self.blocks.chunks_exact(layout.block_floats).enumerate() {
+            let count = BLOCK_KEYS.min(inputs.count - index * BLOCK_KEYS);
+            let steps = count.div_ceil(STEP);
+            let (keys, values) = layout.split(block);
+            let bias = self.bias.map(|(bias, _)| &bias[index * BLOCK_KEYS..][..BLOCK_KEYS]);
+            for (panel, a) in q.chunks_exact(layout.key_floats).enumerate() {
+                for (j, b) in keys.chunks_exact(layout.key_floats).take(steps).enumerate() {
+                    let to = &mut logits[j * SIDE..];
+                    // SAFETY: both panels have `depth` steps; `to` 32 rows of `BLOCK_KEYS`, of which panel `j` is inside.
+                    unsafe { product(&tiles, parts, depth, (a.as_ptr(), b.as_ptr()), to.as_mut_ptr(), BLOCK_KEYS) };
+                }
+                let sums = &mut sums[panel * SIDE * sums_width..][..SIDE * sums_width];
+                let mut rows = Rows {
+                    parts,
+                    logits,
+                    weights,
+                    sums,
+                    sums_width,
+                    totals: &mut totals[panel * SIDE * V::W..][..SIDE * V::W],
+                    largest: (!flat).then(|| &mut largest[panel * SIDE..][..SIDE]),
+                };
+                rows.weigh(queries - panel * SIDE, bias, count);
+                for c in 0..channels {
+                    let (b, to) = (&values[c * layout.value_floats..], &mut sums[c * SIDE..]);
+                    let both = (weights.as_ptr(), b.as_ptr());
+                    // SAFETY: both panels have room for `steps` steps; `to` has 32 rows of `sums_width`, `c` inside.
+                    unsafe { product_onto(&tiles, parts, steps, both, to.as_mut_ptr(), sums_width) };
+                }
+            }
+        }
+        drop(tiles);
+        for r in 0..queries {
+            // SAFETY: one vector a row.
+            let total = V::sum(unsafe { V::load(totals[r * V::W..][..V::W].as_ptr()) });
+            let at = (batch * shape.tokens + first + r) * shape.width() + head * d;
+            // SAFETY: batch, head and query block identify the task, so no other task writes these columns of this row.
+            let row = unsafe { self.out.row(at, d) };
+            let scale = 1.0 / total;
+            row.iter_mut().zip(&sums[r * sums_width..]).for_each(|(o, s)| *o = s * scale);
+            if let Some(log_sums) = self.log_sums {
+                // SAFETY: as above.
+                let to = unsafe { log_sums.row((batch * shape.heads + head) * shape.tokens + first + r, 1) };
+                to[0] = if flat { 0.0 } else { largest[r] } + total.log2();
+            }
+        }
+    }
+}
+
+/// As [`super::run`], products in these parts.
+pub(super) fn run(parts: Parts, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32], log_sums: Option<Output>) {
+    let bias = whole_blocks(inputs);
+    let bias = bias.as_ref().map(|(bias, largest)| (&bias[..], *largest));
+    let layout = Layout::new(parts, shape.head_dim, inputs.count);
+    let head_floats = layout.blocks * layout.block_floats;
+    let mut memory = PACKED.take();
+    let packed = memory.at_least(shape.batch * shape.heads * head_floats);
+    let mut sizes = vec![Sizes::default(); shape.batch * shape.heads * layout.blocks];
+    packed.par_chunks_exact_mut(layout.block_floats).zip(&mut sizes).enumerate().for_each(|(index, (block, sizes))| {
+        *sizes = pack(inputs, &shape, &layout, index, block);
+    });
+    let packed = &*packed;
+    let sizes: Vec<Sizes> = sizes
+        .chunks_exact(layout.blocks)
+        .map(|head| head.iter().copied().reduce(Sizes::or).unwrap_or_default())
+        .collect();
+    let query_blocks = shape.tokens.div_ceil(BLOCK_QUERIES);
+    let output = Output { start: out.as_mut_ptr(), len: out.len() };
+    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {
+        let (head_index, query_block) = (index / query_blocks, index % query_blocks);
+        let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
+        let source = Source { inputs, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
+        let blocks = &packed[head_index * head_floats..][..head_floats];
+        // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
+        SCRATCH.with_borrow_mut(|scratch| {
+            let sizes = sizes[head_index];
+            let task = Task { source, layout: &layout, blocks, sizes, bias, scratch, out: output, log_sums };
+            // SAFETY: `Isa::Amx`, under which alone this runs, exists only where the features were detected.
+            unsafe { task.run() };
+        });
+    });
+    PACKED.set(memory);
+}
