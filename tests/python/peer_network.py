@@ -1,8 +1,10 @@
 """Times a PyTorch forward pass of the same shapes as `storm bench`: the peer our network is compared with.
 
     python peer_network.py [--embed 768 --depth 12 --heads 12 --height 160 --width 240 --views 12 --runs 3]
+                           [--bf16] [--compile]
 
-Random weights; images to Gaussians, velocities and motion weights (no rendering), fp32, eager, all cores.
+Random weights; images to Gaussians, velocities and motion weights (no rendering), all cores; fp32, or bf16 by autocast;
+eager, or by torch.compile (which wants a C++ compiler; what it takes to compile is not counted).
 Prints one JSON line: seconds per run and peak memory.
 """
 import argparse
@@ -46,6 +48,8 @@ def main():
     p = argparse.ArgumentParser()
     for name, value in dict(embed=768, depth=12, heads=12, height=160, width=240, views=12, runs=3).items():
         p.add_argument(f"--{name}", type=int, default=value)
+    p.add_argument("--bf16", action="store_true")
+    p.add_argument("--compile", action="store_true")
     a = p.parse_args()
     torch.manual_seed(0)
     grid = (a.height // 8, a.width // 8)
@@ -60,20 +64,26 @@ def main():
     key = torch.nn.Sequential(torch.nn.Linear(128, 256), torch.nn.GELU(), torch.nn.Linear(256, MOTION_DIM))
     queries, bases = torch.randn(MOTION_TOKENS, MOTION_DIM), torch.randn(MOTION_TOKENS, 3)
     image = torch.randn(a.views, 9, a.height, a.width)
+
+    def forward():
+        tokens = patch(image).flatten(2).transpose(1, 2).reshape(1, -1, a.embed)
+        tokens = torch.cat([torch.zeros(1, EXTRA_TOKENS, a.embed, dtype=tokens.dtype), tokens], 1)
+        tokens = norm(blocks(tokens))[:, EXTRA_TOKENS:].reshape(a.views, -1, a.embed)
+        features = up(tokens.transpose(1, 2).reshape(a.views, a.embed, *grid)).permute(0, 2, 3, 1)
+        weights = torch.softmax((key(features) @ queries.T).float() / 0.5, -1)
+        return gaussians(tokens), weights @ bases
+
     times = []
-    with torch.inference_mode():
+    with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16, enabled=a.bf16):
+        if a.compile:
+            forward = torch.compile(forward)
+            forward()
         for _ in range(a.runs):
             start = time.perf_counter()
-            tokens = patch(image).flatten(2).transpose(1, 2).reshape(1, -1, a.embed)
-            tokens = torch.cat([torch.zeros(1, EXTRA_TOKENS, a.embed), tokens], 1)
-            tokens = norm(blocks(tokens))[:, EXTRA_TOKENS:].reshape(a.views, -1, a.embed)
-            gaussians(tokens)
-            features = up(tokens.transpose(1, 2).reshape(a.views, a.embed, *grid)).permute(0, 2, 3, 1)
-            weights = torch.softmax(key(features) @ queries.T / 0.5, -1)
-            weights @ bases
+            forward()
             times.append(time.perf_counter() - start)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps({"torch": torch.__version__, "threads": torch.get_num_threads(), "seconds": times, "peak_rss_mb": peak_mb}))
+    print(json.dumps({"torch": torch.__version__, "threads": torch.get_num_threads(), "bf16": a.bf16, "compiled": a.compile, "seconds": times, "peak_rss_mb": peak_mb}))
 
 
 if __name__ == "__main__":

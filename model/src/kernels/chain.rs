@@ -14,10 +14,15 @@ use super::math::activation;
 use super::{norm, rows};
 use crate::ops::Activation;
 
-/// Rows a task starts with at most.
-const TASK_ROWS: usize = 96;
-/// Floats between two layers a task holds at most, where whole tiles allow: with their packed form they fit a cache of 512 KiB.
-const TASK_FLOATS: usize = 48 * 1024;
+/// Rows a task starts with at most, and floats between two layers it holds at most, where whole tiles allow.
+fn task_size(isa: Isa) -> (usize, usize) {
+    match isa {
+        // What lies between waits in the third-level cache: fetching the weights anew for fewer rows would take longer.
+        Isa::Amx => (192, 192 * 3072),
+        // With their packed form they fit a cache of 512 KiB.
+        _ => (96, 48 * 1024),
+    }
+}
 
 /// One layer; its rows are its input's values cut anew into its own width.
 #[derive(Debug, Clone, Copy)]
@@ -131,8 +136,9 @@ pub fn chain(isa: Isa, x: &[f32], width: usize, steps: &[Step<'_>], residual: Op
     });
     let tile = isa.row_step();
     let count = x.len() / width;
-    let share = gemm::task_rows(isa, count).min(TASK_ROWS);
-    let rows = share.min(TASK_FLOATS / largest / tile * tile).max(tile);
+    let (most_rows, most_floats) = task_size(isa);
+    let share = gemm::task_rows(isa, count).min(most_rows);
+    let rows = share.min(most_floats / largest / tile * tile).max(tile);
     let tasks = out.par_chunks_mut(rows * per_row).zip(x.par_chunks(rows * width)).enumerate();
     tasks.for_each(|(index, (out, x))| {
         let residual = residual.map(|r| &r[index * rows * per_row..][..out.len()]);

@@ -8,7 +8,7 @@ use std::cell::Cell;
 
 use rayon::prelude::*;
 
-use super::{BLOCK_ROWS, Block, Epilogue, PackedWeight, Rows, SCRATCH, Scratch, task_rows};
+use super::{Block, Epilogue, PackedWeight, Rows, SCRATCH, Scratch, block_rows, task_rows};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
 use crate::kernels::math;
@@ -61,7 +61,7 @@ fn weight_gradient_with(
         _ => &*kept.insert(PackedWeight::transposed(isa, x, k, m)),
     };
     let threads = rayon::current_num_threads();
-    let rows = n.div_ceil(threads).next_multiple_of(isa.row_step()).min(BLOCK_ROWS);
+    let rows = n.div_ceil(threads).next_multiple_of(isa.row_step()).min(block_rows(isa));
     out.par_chunks_mut(rows * k).enumerate().for_each(|(i, out)| {
         let x = Rows::Standing { values: grad, stride: n, first: i * rows };
         let epilogue = Epilogue { bias: None, act: Activation::None, residual: None };

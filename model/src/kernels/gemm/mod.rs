@@ -3,7 +3,7 @@
 //! Blocking, from the inside out (the usual one, after Goto and van de Geijn, "Anatomy of High-Performance Matrix
 //! Multiplication", 2008): a tile of `tile_rows x tile_cols` accumulators stays in registers over `panel_depth`
 //! products; its right-hand panel (16 KiB) stays in the first-level cache while all row panels of the block pass by;
-//! the block of `x` (at most `BLOCK_ROWS` rows) is packed once and stays in the second level; partial sums wait in a
+//! the block of `x` (at most [`block_rows`]) is packed once and stays in the second level; partial sums wait in a
 //! block `BLOCK_COLS` wide. Weights are packed once per layer ([`PackedWeight`]).
 //!
 //! Every output is summed in the order of `k`, in blocks fixed by `k` alone: neither the split over threads nor the
@@ -33,8 +33,15 @@ pub use backward::{Mlp, MlpGradients, column_sums, mlp_backward, mlp_keeping, we
 pub use pack::PackedWeight;
 pub(crate) use tile::{Floats, Pairs, tile, tile_of};
 
-/// Rows of `x` a task works on at most: a multiple of both tile heights.
-const BLOCK_ROWS: usize = 96;
+/// Rows of `x` a task works on at most: a multiple of every tile's height.
+fn block_rows(isa: Isa) -> usize {
+    match isa {
+        // Tile units are so fast that fetching weights would take longer with fewer rows.
+        Isa::Amx => 192,
+        _ => 96,
+    }
+}
+
 /// Columns of partial sums kept at a time (`96 x 512` floats are 192 KiB).
 const BLOCK_COLS: usize = 512;
 /// Floats of a cache line.
@@ -247,7 +254,7 @@ fn check(x: &[f32], w: &PackedWeight, epilogue: &Epilogue<'_>, m: usize, out: us
 
 /// Rows of a task: few enough that every thread gets several, at most a block.
 pub(super) fn task_rows(isa: Isa, m: usize) -> usize {
-    m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(isa.row_step()).min(BLOCK_ROWS)
+    m.div_ceil(TASKS_PER_THREAD * rayon::current_num_threads()).next_multiple_of(isa.row_step()).min(block_rows(isa))
 }
 
 impl<'a> Epilogue<'a> {
