@@ -273,21 +273,30 @@ impl TrainClip {
     }
 
     /// The same on another device.
-    pub fn to_device(&self, device: &Device) -> Result<Self, TrainError> {
+    pub fn to_device(&self, device: &Device) -> candle_core::Result<Self> {
+        self.map(&|x| x.to_device(device))
+    }
+
+    /// Each clip of the batch alone.
+    pub(super) fn apart(&self) -> candle_core::Result<Vec<Self>> {
+        let clips = self.context.image.dim(0)?;
+        (0..clips).map(|at| self.map(&|x| x.narrow(0, at, 1)?.contiguous())).collect()
+    }
+
+    fn map(&self, to: &impl Fn(&Tensor) -> candle_core::Result<Tensor>) -> candle_core::Result<Self> {
         Ok(Self {
-            context: clip_to(&self.context, device)?,
-            context_truth: self.context_truth.to_device(device)?,
-            sky: self.sky.to_device(device)?,
+            context: map_clip(&self.context, to)?,
+            context_truth: self.context_truth.map(to)?,
+            sky: self.sky.map(to)?,
             target: match &self.target {
-                Some((clip, truth)) => Some((clip_to(clip, device)?, truth.to_device(device)?)),
+                Some((clip, truth)) => Some((map_clip(clip, to)?, truth.map(to)?)),
                 None => None,
             },
         })
     }
 }
 
-fn clip_to(clip: &ClipBatch, device: &Device) -> candle_core::Result<ClipBatch> {
-    let to = |x: &Tensor| x.to_device(device);
+fn map_clip(clip: &ClipBatch, to: impl Fn(&Tensor) -> candle_core::Result<Tensor>) -> candle_core::Result<ClipBatch> {
     Ok(ClipBatch {
         image: to(&clip.image)?,
         intrinsics: to(&clip.intrinsics)?,

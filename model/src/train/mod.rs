@@ -22,6 +22,7 @@ mod render_stage;
 #[cfg(test)]
 mod render_tests;
 mod schedule;
+mod shares;
 mod source;
 mod trainer;
 mod truth;

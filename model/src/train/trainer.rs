@@ -17,6 +17,7 @@ use super::options::{Stage, TrainOptions};
 use super::pixel::{PixelLossOptions, pixel_losses};
 use super::raster::SharedRenderer;
 use super::render_stage::render_stage_losses;
+use super::shares::{self, Learned};
 use crate::config::ModelConfig;
 use crate::error::ModelError;
 use crate::network::Storm;
@@ -51,7 +52,8 @@ pub struct Trainer {
     vars: Vec<Var>,
     frozen: Tensors,
     model: Storm,
-    renderer: SharedRenderer,
+    /// One for each thread that learns.
+    renderers: Vec<SharedRenderer>,
     features: Option<Arc<FeatureNetwork>>,
     step: u64,
 }
@@ -90,14 +92,28 @@ impl Trainer {
         tensors.extend(slots.iter().zip(&vars).map(|(s, v)| (s.name.clone(), v.as_tensor().clone())));
         let model = Storm::new(config, &tensors)?;
         let config = Arc::new(model.config().clone());
-        let raster = CpuRasterizer::new(config.raster_settings()).map_err(|e| ModelError::Render(e.to_string()))?;
-        let renderer: SharedRenderer = Arc::new(Mutex::new(raster));
-        Ok(Self { config, options, device: device.clone(), slots, vars, frozen, model, renderer, features: None, step })
+        let renderer = || {
+            let raster = CpuRasterizer::new(config.raster_settings()).map_err(|e| ModelError::Render(e.to_string()))?;
+            Ok::<SharedRenderer, ModelError>(Arc::new(Mutex::new(raster)))
+        };
+        let renderers = (0..rayon::current_num_threads()).map(|_| renderer()).collect::<Result<_, _>>()?;
+        Ok(Self {
+            config,
+            options,
+            device: device.clone(),
+            slots,
+            vars,
+            frozen,
+            model,
+            renderers,
+            features: None,
+            step,
+        })
     }
 
     /// Draws with another renderer from now on.
     pub fn set_renderer(&mut self, renderer: SharedRenderer) {
-        self.renderer = renderer;
+        self.renderers.iter_mut().for_each(|r| *r = Arc::clone(&renderer));
     }
 
     /// Uses a feature network for the perceptual term from now on; `name` goes into checkpoints and metadata.
@@ -164,38 +180,25 @@ impl Trainer {
     /// # Errors
     /// [`TrainError::NonFinite`] names the step and the tensor; the weights are then still those before the step.
     pub fn step(&mut self, clip: &TrainClip) -> Result<StepReport, TrainError> {
-        let start = Instant::now();
-        let moved;
-        let clip = if self.device.is_cpu() {
-            clip
-        } else {
-            moved = clip.to_device(&self.device)?;
-            &moved
+        // Elsewhere than on a processor one graph of the whole batch is fastest.
+        let shares = match self.device.is_cpu() {
+            true => clip.apart()?,
+            false => vec![clip.to_device(&self.device)?],
         };
-        let output = self.model.forward(&clip.context)?;
-        let terms = self.losses(&output, clip)?;
-        let values = terms.values()?;
+        let losses = |clip: &TrainClip, renderer: &SharedRenderer| -> Result<Terms, TrainError> {
+            Ok(self.losses(&self.model.forward(&clip.context)?, clip, renderer)?)
+        };
+        let learned = shares::learn(&shares, &self.vars, &losses, &self.renderers)?;
+        let Learned { terms: values, gradients, seconds: [forward_sec, backward_sec] } = learned;
         if let Some((name, _)) = values.iter().find(|(_, x)| !x.is_finite()) {
             return Err(self.non_finite(format!("loss {name}"), 1));
         }
-        let total = terms.total()?;
-        let forward_sec = start.elapsed().as_secs_f64();
-        let start = Instant::now();
-        let grads = total.backward()?;
-        let mut gradients = Vec::with_capacity(self.vars.len());
-        for (var, slot) in self.vars.iter().zip(&self.slots) {
-            let gradient = match grads.get(var) {
-                Some(g) => Some(g.flatten_all()?.to_vec1::<f32>()?),
-                None => None,
-            };
+        for (gradient, slot) in gradients.iter().zip(&self.slots) {
             let bad = gradient.iter().flatten().filter(|x| !x.is_finite()).count();
             if bad > 0 {
                 return Err(self.non_finite(format!("gradient of {}", slot.name), bad));
             }
-            gradients.push(gradient);
         }
-        drop((grads, output, terms));
-        let backward_sec = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let learning_rate = self.options.schedule.at(self.step);
         let TrainOptions { average_decay: decay, adam, optimizer, .. } = self.options;
@@ -220,22 +223,25 @@ impl Trainer {
         })
     }
 
-    fn losses(&self, output: &crate::ClipOutput, clip: &TrainClip) -> Result<Terms, ModelError> {
+    fn losses(
+        &self,
+        output: &crate::ClipOutput,
+        clip: &TrainClip,
+        renderer: &SharedRenderer,
+    ) -> Result<Terms, ModelError> {
         let features = self.features.as_deref();
         if let (Some(name), None) = (&self.options.features, features) {
             return Err(ModelError::Input(format!("the run was started with feature network {name}; give it again")));
         }
         match self.options.stage_at(self.step) {
             Stage::Pixel => pixel_losses(output, clip, &self.options.pixel),
-            Stage::Render => {
-                render_stage_losses(output, clip, &self.renderer, &self.options.render, features, self.step)
-            }
+            Stage::Render => render_stage_losses(output, clip, renderer, &self.options.render, features, self.step),
             Stage::Both => {
                 // The velocity regulariser is in the paper's losses already.
                 let pixel = PixelLossOptions { velocity: 0.0, ..self.options.pixel };
                 let mut terms = pixel_losses(output, clip, &pixel)?;
                 let render = &self.options.render;
-                terms.extend(render_stage_losses(output, clip, &self.renderer, render, features, self.step)?);
+                terms.extend(render_stage_losses(output, clip, renderer, render, features, self.step)?);
                 Ok(terms)
             }
         }

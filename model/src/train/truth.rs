@@ -97,8 +97,8 @@ impl Truth {
         })
     }
 
-    pub(super) fn to_device(&self, device: &Device) -> candle_core::Result<Self> {
-        let to = |x: &Tensor| x.to_device(device);
+    /// The same with every tensor put through `to`.
+    pub(super) fn map(&self, to: impl Fn(&Tensor) -> candle_core::Result<Tensor>) -> candle_core::Result<Self> {
         Ok(Self {
             depth: to(&self.depth)?,
             distance: to(&self.distance)?,
@@ -161,8 +161,8 @@ impl SkySamples {
         Ok(Self { directions: cat(|x| &x.directions)?, colors: cat(|x| &x.colors)?, weights: cat(|x| &x.weights)? })
     }
 
-    pub(super) fn to_device(&self, device: &Device) -> candle_core::Result<Self> {
-        let to = |x: &Tensor| x.to_device(device);
+    /// The same with every tensor put through `to`.
+    pub(super) fn map(&self, to: impl Fn(&Tensor) -> candle_core::Result<Tensor>) -> candle_core::Result<Self> {
         Ok(Self { directions: to(&self.directions)?, colors: to(&self.colors)?, weights: to(&self.weights)? })
     }
 }

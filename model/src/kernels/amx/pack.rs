@@ -34,8 +34,7 @@ pub(in crate::kernels) fn words_of(parts: Parts, low: __m512, high: __m512) -> [
             // The high half of each word, first of `low`, then of `high`.
             let odd = odd_halves();
             let (a, b) = (split(low), split(high));
-            let join =
-                |k: usize| _mm512_permutex2var_epi16(_mm512_castps_si512(a[k]), odd, _mm512_castps_si512(b[k]));
+            let join = |k: usize| _mm512_permutex2var_epi16(_mm512_castps_si512(a[k]), odd, _mm512_castps_si512(b[k]));
             [join(0), join(1), join(2)]
         }
     }

@@ -63,7 +63,8 @@ fn columns_are_rows_transposed() {
     }
     for depth in [1, 5, 32, 70] {
         let values = noise(3, depth * TILE, 1.0);
-        let turned: Vec<f32> = (0..TILE).flat_map(|c| (0..depth).map(move |p| (c, p))).map(|(c, p)| values[p * TILE + c]).collect();
+        let turned: Vec<f32> =
+            (0..TILE).flat_map(|c| (0..depth).map(move |p| (c, p))).map(|(c, p)| values[p * TILE + c]).collect();
         for parts in [Parts::One, Parts::Three] {
             let floats = parts.panel_floats(depth);
             let (mut columns, mut rows) = (vec![0.0; floats], vec![0.0; floats]);
@@ -85,9 +86,8 @@ fn three_parts_are_the_float() {
     }
     for x in [1.0f32, -0.1, 1e30, 1e-30, f32::MAX, std::f32::consts::PI, 16_777_215.0] {
         // SAFETY: the machine has the units.
-        let parts = unsafe {
-            split(std::arch::x86_64::_mm512_set1_ps(x)).map(|v| std::arch::x86_64::_mm512_cvtss_f32(v))
-        };
+        let parts =
+            unsafe { split(std::arch::x86_64::_mm512_set1_ps(x)).map(|v| std::arch::x86_64::_mm512_cvtss_f32(v)) };
         assert_eq!(parts[0] + (parts[1] + parts[2]), x);
         assert!(parts.iter().all(|p| p.to_bits() & 0xffff == 0), "{parts:?}");
     }

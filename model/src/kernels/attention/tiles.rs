@@ -11,7 +11,8 @@ use super::pack::{Inputs, Shape, Sizes, Source, larger, logit_scale, squares};
 use super::{BLOCK_KEYS, FLAT_LOGITS, FLAT_VALUES, Output, PACKED, whole_blocks};
 use crate::kernels::aligned::Aligned;
 use crate::kernels::amx::{
-    Configured, Parts, SIDE, STEP, TILE, TILE_FLOATS, column_tiles, product, product_onto, row_tiles, transpose, words_of,
+    Configured, Parts, SIDE, STEP, TILE, TILE_FLOATS, column_tiles, product, product_onto, row_tiles, transpose,
+    words_of,
 };
 use crate::kernels::math::{exp2, exp2_short};
 use crate::kernels::simd::{Avx512, Simd};

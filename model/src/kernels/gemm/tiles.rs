@@ -11,7 +11,9 @@ use super::tile::{finish, finish_tile};
 use super::{Block, Epilogue, PackedWeight, Rows};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
-use crate::kernels::amx::{Configured, Parts, SIDE, STEP, TILE, column_tiles, product, product_onto, row_tiles, transpose};
+use crate::kernels::amx::{
+    Configured, Parts, SIDE, STEP, TILE, column_tiles, product, product_onto, row_tiles, transpose,
+};
 use crate::kernels::gemm::pack::Numbers;
 use crate::kernels::simd::Simd;
 
