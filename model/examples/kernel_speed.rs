@@ -66,6 +66,7 @@ fn main() -> Result<()> {
             report(&format!("attention n={n} heads={heads} d={d}"), flop, time(|| ops::attention(&qkv, heads))?, peak);
             let whole = || ops::attention_at(&qkv, heads, Precision::Int16);
             report("  in whole numbers", flop, time(whole)?, peak);
+            report("  in bf16", flop, time(|| ops::attention_at(&qkv, heads, Precision::Bf16))?, peak);
             if n < 2000 {
                 report("  plain candle", flop, time(|| plain::attention(&qkv, heads))?, peak);
             }
@@ -90,6 +91,8 @@ fn main() -> Result<()> {
             report(&name("linear"), flop, time(|| ops::linear(&x, &layer, Activation::None, None))?, peak);
             let whole = layer.at(Precision::Int16);
             report("  in whole numbers", flop, time(|| ops::linear(&x, &whole, Activation::None, None))?, peak);
+            let bf16 = layer.at(Precision::Bf16);
+            report("  in bf16", flop, time(|| ops::linear(&x, &bf16, Activation::None, None))?, peak);
             report(
                 "  + GELU + residual",
                 flop,

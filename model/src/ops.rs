@@ -25,6 +25,7 @@ use crate::kernels::gemm::{self, Epilogue, PackedWeight};
 use crate::kernels::tensors::{covered, tracked, with_all, with_optional, with_values};
 use crate::kernels::{self, Isa};
 use crate::plain;
+use process::zeros;
 
 pub(crate) use arrange::{gaussians, patches, unnest};
 pub use chain::{Step, chain};
@@ -139,7 +140,7 @@ pub fn attention_at(qkv: &Tensor, heads: usize, precision: Precision) -> Result<
     if qkv.track_op() {
         return training::attention(qkv, shape);
     }
-    let mut out = vec![0f32; batch * tokens * d3 / 3];
+    let mut out = zeros(batch * tokens * d3 / 3);
     with_values(qkv, |values| {
         let rows = |part: usize| Rows { values, stride: d3, first: part * d3 / 3 };
         let inputs = Inputs { queries: rows(0), keys: rows(1), values: rows(2), count: tokens, bias: None };
@@ -185,7 +186,7 @@ pub fn cross_attention(
     }
     let shape = Shape { batch, tokens, heads, head_dim: d / heads };
     let bias: Option<Vec<f32>> = sizes.map(|sizes| sizes.iter().map(|s| s.log2()).collect());
-    let mut out = vec![0f32; queries.elem_count()];
+    let mut out = zeros(queries.elem_count());
     with_all(inputs, |[queries, kv]| {
         let half = |first: usize| Rows { values: kv, stride: d2, first };
         let queries = Rows { values: queries, stride: d, first: 0 };
@@ -217,7 +218,7 @@ pub fn linear(x: &Tensor, layer: &Linear, act: Activation, residual: Option<&Ten
     if tracked(inputs.into_iter().flatten()) {
         return training::linear(x, layer, act, residual, &dims);
     }
-    let mut out = vec![0f32; dims.iter().product()];
+    let mut out = zeros(dims.iter().product());
     with_values(x, |x| {
         with_optional(residual, |residual| {
             layer.with_parts(|packed, bias| {
@@ -248,7 +249,7 @@ pub fn mlp(x: &Tensor, first: &Linear, act: Activation, second: &Linear, residua
     if tracked(inputs.into_iter().flatten()) {
         return training::mlp(x, first, act, second, residual, &dims);
     }
-    let mut out = vec![0f32; dims.iter().product()];
+    let mut out = zeros(dims.iter().product());
     with_values(x, |x| {
         with_optional(residual, |residual| {
             first.with_parts(|w1, bias| {
@@ -280,7 +281,7 @@ pub fn layer_norm(x: &Tensor, weight: Option<&Tensor>, bias: Option<&Tensor>, ep
     if tracked([Some(x), weight, bias].into_iter().flatten()) {
         return training::layer_norm(x, weight, bias, eps);
     }
-    let mut out = vec![0f32; x.elem_count()];
+    let mut out = zeros(x.elem_count());
     with_values(x, |x| {
         with_optional(weight, |weight| {
             with_optional(bias, |bias| {
@@ -312,7 +313,7 @@ fn map(x: &Tensor, act: Activation) -> Result<Tensor> {
     if x.track_op() {
         return training::map(x, act);
     }
-    let mut out = vec![0f32; x.elem_count()];
+    let mut out = zeros(x.elem_count());
     with_values(x, |values| {
         kernels::rows::activate(Isa::detect(), act, values, None, &mut out);
         Ok(())
@@ -329,7 +330,7 @@ pub fn softmax(x: &Tensor, tau: f64) -> Result<Tensor> {
     if x.track_op() {
         return training::softmax(x, tau);
     }
-    let mut out = vec![0f32; x.elem_count()];
+    let mut out = zeros(x.elem_count());
     with_values(x, |values| {
         kernels::rows::softmax(Isa::detect(), values, width, tau as f32, &mut out);
         Ok(())

@@ -2,6 +2,7 @@
 
 use candle_core::{Result, Tensor};
 
+use super::process::zeros;
 use crate::kernels::gaussians::{Input, Meaning, Output};
 use crate::kernels::tensors::{covered, tracked, with_all, with_values};
 use crate::kernels::{self, Isa};
@@ -26,7 +27,7 @@ pub(crate) fn patches(image: &Tensor, planes: &Tensor, p: usize) -> Result<Tenso
             .contiguous()?
             .reshape(shape);
     }
-    let mut out = vec![0f32; shape.0 * shape.1];
+    let mut out = zeros(shape.0 * shape.1);
     with_all([image, planes], |[image, planes]| {
         kernels::arrange::patches(&[(image, a), (planes, b)], [views, h, w], p, &mut out);
         Ok(())
@@ -41,7 +42,7 @@ pub(crate) fn unnest(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<
     let pictures = all / (grid.0 * grid.1 * side * side).max(1);
     let result = (pictures, grid.0 * side, grid.1 * side, c);
     if ready([x]) && pictures * grid.0 * grid.1 * side * side == all {
-        let mut out = vec![0f32; x.elem_count()];
+        let mut out = zeros(x.elem_count());
         with_values(x, |x| {
             kernels::arrange::unnest(x, c, grid, levels, &mut out);
             Ok(())
@@ -69,7 +70,7 @@ pub(crate) fn gaussians(
         return Ok(None);
     }
     let pixels: usize = dims.iter().product();
-    let mut out = [3, 3, 4, 1, 3, 1].map(|channels| vec![0f32; channels * pixels]);
+    let mut out = [3, 3, 4, 1, 3, 1].map(|channels| zeros(channels * pixels));
     let [means, scales, quats, opacities, colors, depths] = &mut out;
     with_all([raw, image, origins, directions], |[raw, image, origins, directions]| {
         let input = Input { raw, image, origins, directions, dims };

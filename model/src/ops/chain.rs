@@ -2,6 +2,7 @@
 
 use candle_core::{D, Result, Tensor};
 
+use super::process::zeros;
 use super::{Activation, Linear, gelu, layer_norm, linear, mlp, silu, softmax};
 use crate::kernels::tensors::{covered, tracked, with_each};
 use crate::kernels::{self, Isa};
@@ -140,7 +141,7 @@ pub fn chain(x: &Tensor, steps: &[Step<'_>], residual: Option<&Tensor>) -> Resul
         _ => Ok(None),
     });
     let weights = weights.collect::<Result<Vec<_>>>()?;
-    let mut out = vec![0f32; dims.iter().product()];
+    let mut out = zeros(dims.iter().product());
     with_each(&inputs, |values| {
         let mut values = values.iter().copied();
         let input = values.next().unwrap_or_default();

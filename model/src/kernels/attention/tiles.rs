@@ -14,7 +14,7 @@ use crate::kernels::amx::{
     Configured, Parts, SIDE, STEP, TILE, TILE_FLOATS, column_tiles, product, product_onto, row_tiles, transpose,
     words_of,
 };
-use crate::kernels::math::{exp2, exp2_short};
+use crate::kernels::math::{exp2, exp2_rough, exp2_short};
 use crate::kernels::simd::{Avx512, Simd};
 
 /// Queries of a task: keys and values are fetched from the third-level cache once for all of them.
@@ -110,7 +110,52 @@ struct Task<'a> {
     log_sums: Option<Output>,
 }
 
-/// Logits of 32 queries and what becomes of them.
+/// Weights `2^logit` of a panel of 32 keys, `there` of them real, for logits within [`FLAT_LOGITS`]; `to` is the step of the
+/// left-hand panel that they are, `totals` a vector a row.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx512vnni,avx2,fma")]
+fn weigh_flat<const ONE: bool>(
+    logits: &[f32],
+    bias: Option<&[f32]>,
+    there: usize,
+    queries: usize,
+    to: &mut [f32],
+    totals: &mut [f32],
+) {
+    let parts = if ONE { Parts::One } else { Parts::Three };
+    // SAFETY: a bias is of whole panels.
+    let [low_bias, high_bias] = bias.map_or([V::zero(); 2], |b| unsafe {
+        let b = &b[..SIDE];
+        [V::load(b.as_ptr()), V::load(b[TILE..].as_ptr())]
+    });
+    let rows = logits.chunks_exact(SIDE).zip(totals.chunks_exact_mut(V::W)).take(queries);
+    for (r, (logits, total)) in rows.enumerate() {
+        // SAFETY: rows of two vectors, totals of one.
+        let (mut low, mut high, sum) =
+            unsafe { (V::load(logits.as_ptr()), V::load(logits[TILE..].as_ptr()), V::load(total.as_ptr())) };
+        if bias.is_some() {
+            (low, high) = (V::add(low, low_bias), V::add(high, high_bias));
+        }
+        // Where weights are rounded to bf16 a rough power is more than fine.
+        (low, high) = match ONE {
+            true => (exp2_rough::<V>(low), exp2_rough::<V>(high)),
+            false => (exp2_short::<V>(low), exp2_short::<V>(high)),
+        };
+        if there < SIDE {
+            (low, high) = (first_of(low, there), first_of(high, there.saturating_sub(TILE)));
+        }
+        let words = words_of(parts, low, high);
+        for (part, words) in words.into_iter().take(parts.count()).enumerate() {
+            let to = &mut to[(2 * part + r / TILE) * TILE_FLOATS + r % TILE * TILE..][..TILE];
+            // SAFETY: 16 words, as just cut.
+            unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), words) };
+        }
+        // SAFETY: one vector.
+        unsafe { V::store(total.as_mut_ptr(), V::add(sum, V::add(low, high))) };
+    }
+}
+
+/// Logits of 32 queries, the largest of which is subtracted, and what becomes of them.
 struct Rows<'a> {
     parts: Parts,
     /// Rows of `BLOCK_KEYS`.
@@ -122,8 +167,8 @@ struct Rows<'a> {
     sums_width: usize,
     /// A vector a row.
     totals: &'a mut [f32],
-    /// The largest logit so far, where it is subtracted.
-    largest: Option<&'a mut [f32]>,
+    /// The largest logit so far.
+    largest: &'a mut [f32],
 }
 
 impl Rows<'_> {
@@ -132,31 +177,27 @@ impl Rows<'_> {
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx512vnni,avx2,fma")]
     fn weigh(&mut self, queries: usize, bias: Option<&[f32]>, count: usize) {
         let width = count.next_multiple_of(STEP);
-        for r in 0..queries.min(SIDE) {
+        for r in 0..queries {
             let logits = &self.logits[r * BLOCK_KEYS..][..width];
             let total = &mut self.totals[r * V::W..][..V::W];
             // SAFETY: one vector, as just cut.
             let mut sum = unsafe { V::load(total.as_ptr()) };
-            let mut top = V::zero();
-            if let Some(largest) = &mut self.largest {
-                let before = largest[r];
-                let mut tops = V::splat(before);
-                for (at, one) in logits.chunks_exact(V::W).enumerate() {
-                    // SAFETY: the chunk is a vector, and so is the bias' there.
-                    let logit = unsafe { biased(one, bias, at * V::W) };
-                    let there = first_mask(count.saturating_sub(at * V::W));
-                    tops = _mm512_mask_mov_ps(tops, there, V::max_of(logit, tops));
-                }
-                largest[r] = V::largest(tops);
-                top = V::splat(largest[r]);
-                let shrink = exp2::<V>(V::splat(before - largest[r]));
-                sum = V::mul(sum, shrink);
-                for part in self.sums[r * self.sums_width..][..self.sums_width].chunks_exact_mut(V::W) {
-                    // SAFETY: the chunk is a vector.
-                    unsafe { V::store(part.as_mut_ptr(), V::mul(shrink, V::load(part.as_ptr()))) };
-                }
+            let before = self.largest[r];
+            let mut tops = V::splat(before);
+            for (at, one) in logits.chunks_exact(V::W).enumerate() {
+                // SAFETY: the chunk is a vector, and so is the bias' there.
+                let logit = unsafe { biased(one, bias, at * V::W) };
+                let there = first_mask(count.saturating_sub(at * V::W));
+                tops = _mm512_mask_mov_ps(tops, there, V::max_of(logit, tops));
             }
-            let flat = self.largest.is_none();
+            self.largest[r] = V::largest(tops);
+            let top = V::splat(self.largest[r]);
+            let shrink = exp2::<V>(V::splat(before - self.largest[r]));
+            sum = V::mul(sum, shrink);
+            for part in self.sums[r * self.sums_width..][..self.sums_width].chunks_exact_mut(V::W) {
+                // SAFETY: the chunk is a vector.
+                unsafe { V::store(part.as_mut_ptr(), V::mul(shrink, V::load(part.as_ptr()))) };
+            }
             let (half, row) = (r / TILE, r % TILE);
             let steps = self.weights.chunks_exact_mut(self.parts.step_floats());
             for (step, (two, to)) in logits.chunks_exact(STEP).zip(steps).enumerate() {
@@ -164,10 +205,7 @@ impl Rows<'_> {
                 let (a, b) = unsafe {
                     (biased(&two[..TILE], bias, step * STEP), biased(&two[TILE..], bias, step * STEP + TILE))
                 };
-                let (mut low, mut high) = match flat {
-                    true => (exp2_short::<V>(a), exp2_short::<V>(b)),
-                    false => (exp2::<V>(V::sub(a, top)), exp2::<V>(V::sub(b, top))),
-                };
+                let (mut low, mut high) = (exp2::<V>(V::sub(a, top)), exp2::<V>(V::sub(b, top)));
                 let there = count - step * STEP;
                 if there < STEP {
                     (low, high) = (first_of(low, there), first_of(high, there.saturating_sub(TILE)));
@@ -256,22 +294,37 @@ impl Task<'_> {
             let (keys, values) = layout.split(block);
             let bias = self.bias.map(|(bias, _)| &bias[index * BLOCK_KEYS..][..BLOCK_KEYS]);
             for (panel, a) in q.chunks_exact(layout.key_floats).enumerate() {
-                for (j, b) in keys.chunks_exact(layout.key_floats).take(steps).enumerate() {
-                    let to = &mut logits[j * SIDE..];
-                    // SAFETY: both panels have `depth` steps; `to` 32 rows of `BLOCK_KEYS`, of which panel `j` is inside.
-                    unsafe { product(&tiles, parts, depth, (a.as_ptr(), b.as_ptr()), to.as_mut_ptr(), BLOCK_KEYS) };
-                }
                 let sums = &mut sums[panel * SIDE * sums_width..][..SIDE * sums_width];
-                let mut rows = Rows {
-                    parts,
-                    logits,
-                    weights,
-                    sums,
-                    sums_width,
-                    totals: &mut totals[panel * SIDE * V::W..][..SIDE * V::W],
-                    largest: (!flat).then(|| &mut largest[panel * SIDE..][..SIDE]),
+                let totals = &mut totals[panel * SIDE * V::W..][..SIDE * V::W];
+                let left = (queries - panel * SIDE).min(SIDE);
+                let logits_of = |j: usize, logits: &mut [f32], stride: usize| {
+                    assert!(logits.len() >= (SIDE - 1) * stride + SIDE);
+                    let b = &keys[j * layout.key_floats..][..layout.key_floats];
+                    // SAFETY: both panels have `depth` steps; `logits` 32 rows of 32, `stride` apart, as just asserted.
+                    unsafe { product(&tiles, parts, depth, (a.as_ptr(), b.as_ptr()), logits.as_mut_ptr(), stride) };
                 };
-                rows.weigh(queries - panel * SIDE, bias, count);
+                if flat {
+                    // A panel's products are under way while the one before is weighed.
+                    let (even, odd) = logits.split_at_mut(SIDE * SIDE);
+                    logits_of(0, even, SIDE);
+                    for (j, to) in weights.chunks_exact_mut(parts.step_floats()).take(steps).enumerate() {
+                        let (now, next) = if j % 2 == 0 { (&mut *even, &mut *odd) } else { (&mut *odd, &mut *even) };
+                        if j + 1 < steps {
+                            logits_of(j + 1, next, SIDE);
+                        }
+                        let bias = bias.map(|bias| &bias[j * SIDE..]);
+                        let there = count - j * SIDE;
+                        match parts {
+                            Parts::One => weigh_flat::<true>(now, bias, there, left, to, totals),
+                            Parts::Three => weigh_flat::<false>(now, bias, there, left, to, totals),
+                        }
+                    }
+                } else {
+                    (0..steps).for_each(|j| logits_of(j, &mut logits[j * SIDE..], BLOCK_KEYS));
+                    let largest = &mut largest[panel * SIDE..][..SIDE];
+                    let mut rows = Rows { parts, logits, weights, sums, sums_width, totals, largest };
+                    rows.weigh(left, bias, count);
+                }
                 for c in 0..channels {
                     let (b, to) = (&values[c * layout.value_floats..], &mut sums[c * SIDE..]);
                     let both = (weights.as_ptr(), b.as_ptr());
