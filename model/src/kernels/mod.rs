@@ -42,10 +42,16 @@ pub enum Isa {
 }
 
 impl Isa {
-    /// The widest set this machine runs, looked up once.
+    /// The widest set this machine runs, or the one that `STORM_ISA` names (`portable`, `avx2`, `avx512`, `amx`: to measure one, or
+    /// to get another machine's bits) where the machine has it; looked up once.
     pub fn detect() -> Self {
         static FOUND: OnceLock<Isa> = OnceLock::new();
-        *FOUND.get_or_init(|| Self::available().last().copied().unwrap_or(Isa::Portable))
+        *FOUND.get_or_init(|| {
+            let sets = Self::available();
+            let asked = std::env::var("STORM_ISA").unwrap_or_default();
+            let named = sets.iter().find(|isa| format!("{isa:?}").eq_ignore_ascii_case(&asked));
+            named.or(sets.last()).copied().unwrap_or(Isa::Portable)
+        })
     }
 
     /// Every set this machine runs, narrowest first.

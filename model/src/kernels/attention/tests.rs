@@ -143,3 +143,48 @@ fn same_bits_for_any_thread_count() {
         assert!(one.iter().zip(&run(threads)).all(|(a, b)| a.to_bits() == b.to_bits()), "{threads} threads");
     }
 }
+
+/// Rounding 2^-9 of operands, of logits of a few units and of the weights that follow them.
+const BF16_TOLERANCE: f64 = 5e-2;
+
+proptest::proptest! {
+    #![proptest_config(proptest::prelude::ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn in_bf16_everything_is_rounded_and_nothing_lost(
+        tokens in 1usize..300, count in 1usize..600, heads in 1usize..4, head_dim in 1usize..70, biased: bool, seed in 0u64..1000,
+    ) {
+        let s = Shape { batch: 2, tokens, heads, head_dim };
+        let width = s.width();
+        let queries = noise(seed, 2 * tokens * width, 1.0);
+        let kv = noise(seed + 1, 2 * count * 2 * width, 1.0);
+        let bias = noise(seed + 2, count, 2.0);
+        let rows = |first| Rows { values: &kv, stride: 2 * width, first };
+        let queries = Rows { values: &queries, stride: width, first: 0 };
+        let bias = biased.then_some(&bias[..]);
+        let inputs = Inputs { queries, keys: rows(0), values: rows(width), count, bias };
+        let want = reference(&inputs, s);
+        for isa in Isa::tested() {
+            let mut out = vec![f32::NAN; 2 * tokens * width];
+            attention_in_bf16(isa, &inputs, s, &mut out);
+            let worst = worst_difference(&out, &want);
+            proptest::prop_assert!(worst < BF16_TOLERANCE, "{:?} {:?} {}: {:e}", isa, s, count, worst);
+        }
+    }
+}
+
+#[test]
+fn nan_is_not_lost_in_bf16() {
+    let s = Shape { batch: 1, tokens: 130, heads: 1, head_dim: 40 };
+    for isa in Isa::tested() {
+        // A query reaches its own result; a key and a value all.
+        for (at, reaches) in [(7 * 120 + 3, 1), (7 * 120 + 43, 130), (7 * 120 + 83, 130)] {
+            let mut qkv = noise(1, s.tokens * 120, 1.0);
+            qkv[at] = f32::NAN;
+            let mut out = vec![0.0; s.tokens * s.width()];
+            attention_in_bf16(isa, &Inputs::joined(&qkv, &s), s, &mut out);
+            let rows = out.chunks_exact(40).filter(|row| row.iter().any(|x| !x.is_finite())).count();
+            assert_eq!(rows, reaches, "{isa:?} {at}");
+        }
+    }
+}

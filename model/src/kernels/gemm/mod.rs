@@ -385,6 +385,26 @@ mod tests {
         }
     }
 
+    proptest::proptest! {
+        #![proptest_config(proptest::prelude::ProptestConfig::with_cases(40))]
+
+        /// Operands rounded to bf16 have exact products: only sums differ between those who take them.
+        #[test]
+        fn in_bf16_all_sets_round_alike(m in 1usize..110, n in 1usize..80, k in 1usize..700, seed in 0u64..1000) {
+            let (x, w) = (noise(seed, m * k, 1.0), noise(seed + 1, n * k, 1.0 / (k as f32).sqrt()));
+            let rounded = |x: &[f32]| x.iter().map(|&x| bf16(x)).collect::<Vec<f32>>();
+            let none = Epilogue { bias: None, act: Activation::None, residual: None };
+            let want = reference(&rounded(&x), &rounded(&w), m, n, k, none);
+            for isa in Isa::tested() {
+                let packed = PackedWeight::in_precision(isa, crate::ops::Precision::Bf16, &w, n, k);
+                let mut out = vec![f32::NAN; m * n];
+                linear(&x, &packed, none, &mut out);
+                let worst = worst_difference(&out, &want);
+                proptest::prop_assert!(worst < GEMM_RELATIVE, "{:?} {} {} {}: {:e}", isa, m, n, k, worst);
+            }
+        }
+    }
+
     #[test]
     fn two_layers_at_once_are_two_calls() {
         let (m, k, hidden, n) = (130, 40, 300, 50);

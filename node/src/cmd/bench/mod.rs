@@ -82,7 +82,7 @@ pub struct Args {
     /// With 32,000 tokens too.
     #[arg(long, requires = "sizes")]
     largest: bool,
-    /// A Python with PyTorch: times tests/python/peer_network.py at B/8's size in the same run.
+    /// A Python with PyTorch: times tests/python/peer_network.py at B/8's size in the same run, in f32 and bf16, eager and compiled.
     #[arg(long)]
     peer_python: Option<PathBuf>,
 }
@@ -151,7 +151,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         let mut references = References::new();
         // The peer before and after the rows of its size, so that a slow while of the machine is in both.
         let peer = args.peer_python.as_ref().filter(|_| model == LARGEST);
-        time_peer(peer, &mut report, &bar)?;
+        time_peers(peer, &mut report, &bar)?;
         for row in network_rows.iter().filter(|row| row.large || model != LARGEST) {
             bar.set_message(format!("{model}, {}", row.name));
             let config = row.config(model)?;
@@ -180,7 +180,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             report.settings.push(s);
             bar.inc(1);
         }
-        time_peer(peer, &mut report, &bar)?;
+        time_peers(peer, &mut report, &bar)?;
         if trained {
             bar.set_message("other methods");
             let figures = peers::baselines(&data, &args.methods, &mut || bar.inc(1))?;
@@ -218,24 +218,24 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         report.sizes.push(p);
         bar.inc(1);
     }
-    let peer = args.peer_python.as_ref().filter(|_| report.peer_pytorch.is_none());
-    time_peer(peer, &mut report, &bar)?;
+    let peer = args.peer_python.as_ref().filter(|_| report.peers.is_empty());
+    time_peers(peer, &mut report, &bar)?;
     bar.finish_and_clear();
-    if let Some(peer) = &report.peer_pytorch {
-        let seconds = peer["median_s"].as_f64().unwrap_or(f64::NAN);
-        say!("PyTorch f32 at B/8's size: {seconds:.1} s");
-        if let Some(ratio) = report.peer_times_less() {
-            say!("ours {:.1} s: {ratio:.2} of it", ratio * seconds);
+    for peer in &report.peers {
+        let Some(seconds) = peer.median_s else { continue };
+        say!("PyTorch, {}, at B/8's size: {seconds:.1} s", peer.name);
+        if let Some(ratio) = report.times_less_than(peer) {
+            say!("ours in f32 {:.1} s: {ratio:.2} of it", ratio * seconds);
         }
     }
     write(args, &report)?;
     Ok(Outcome::Done)
 }
 
-fn time_peer(python: Option<&PathBuf>, report: &mut Report, bar: &ProgressBar) -> Result<()> {
+fn time_peers(python: Option<&PathBuf>, report: &mut Report, bar: &ProgressBar) -> Result<()> {
     if let Some(python) = python {
         bar.set_message("PyTorch");
-        report.peer_pytorch = Some(peers::time_peer(python, report.peer_pytorch.as_ref())?);
+        peers::time_peers(python, &mut report.peers)?;
     }
     Ok(())
 }
@@ -272,8 +272,9 @@ fn machine() -> serde_json::Value {
     };
     let flags = field("flags");
     let has = |f: &&str| flags.split(' ').any(|x| x == *f);
-    let simd: Vec<&str> = ["avx2", "fma", "avx512f", "avx512_bf16", "avx512_vnni"].into_iter().filter(has).collect();
-    json!({"cpu": field("model name"), "threads": rayon::current_num_threads(), "simd": simd, "version": env!("CARGO_PKG_VERSION")})
+    let simd: Vec<&str> = ["avx2", "fma", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16"].into_iter().filter(has).collect();
+    let kernels = format!("{:?}", storm_model::kernels::Isa::detect());
+    json!({"cpu": field("model name"), "threads": rayon::current_num_threads(), "simd": simd, "kernels": kernels, "version": env!("CARGO_PKG_VERSION")})
 }
 
 /// Mean number of running programs over the last minute.

@@ -6,6 +6,7 @@ use std::process::Command;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
+use serde::Serialize;
 use serde_json::json;
 use storm_render::world::{Drive, DriveOptions};
 
@@ -55,26 +56,55 @@ pub(super) fn time_world() -> Result<(f64, serde_json::Value)> {
     Ok((fps, json!({"images_per_sec": fps, "picture": [240, 160], "images": WORLD_IMAGES})))
 }
 
-/// Runs of the peer each time it is called, the first of them cold.
+/// Runs of each peer each time it is called, the first of them cold.
 const PEER_RUNS: &str = "2";
+/// How PyTorch is asked to run the network: name and options of the script.
+const PEERS: [(&str, &[&str]); 4] = [
+    ("f32, eager", &[]),
+    ("f32, compiled", &["--compile"]),
+    ("bf16, eager", &["--bf16"]),
+    ("bf16, compiled", &["--bf16", "--compile"]),
+];
 
-/// The same shapes in PyTorch at B/8's size: two more runs to those `before`.
-pub(super) fn time_peer(python: &Path, before: Option<&serde_json::Value>) -> Result<serde_json::Value> {
+/// The network's shapes at B/8's size in another program.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct Peer {
+    pub name: &'static str,
+    /// Every run.
+    pub seconds: Vec<f64>,
+    pub median_s: Option<f64>,
+    /// What it said of itself the last time.
+    pub said: serde_json::Value,
+    /// Why it gave no figures.
+    pub failed: Option<String>,
+}
+
+/// Every way of running PyTorch: two more runs to those before. A way that fails (compiling wants a C++ compiler) says so.
+pub(super) fn time_peers(python: &Path, peers: &mut Vec<Peer>) -> Result<()> {
+    if peers.is_empty() {
+        let new = |name| Peer { name, seconds: Vec::new(), median_s: None, said: json!(null), failed: None };
+        peers.extend(PEERS.map(|(name, _)| new(name)));
+    }
     let script = "tests/python/peer_network.py";
-    let output = Command::new(python)
-        .args([script, "--runs", PEER_RUNS])
-        .output()
-        .with_context(|| format!("cannot run {} {script} (from the project's root)", python.display()))?;
-    let text = String::from_utf8_lossy(&output.stdout);
-    let mut peer: serde_json::Value = serde_json::from_str(text.trim()).with_context(|| {
-        format!("the peer failed: {}", String::from_utf8_lossy(&output.stderr).lines().last().unwrap_or("no output"))
-    })?;
-    let runs = |peer: &serde_json::Value| -> Vec<f64> {
-        peer["seconds"].as_array().into_iter().flatten().filter_map(serde_json::Value::as_f64).collect()
-    };
-    let mut seconds = before.map_or_else(Vec::new, runs);
-    seconds.extend(runs(&peer));
-    peer["seconds"] = json!(seconds);
-    peer["median_s"] = json!(median(seconds));
-    Ok(peer)
+    for (peer, (_, options)) in peers.iter_mut().zip(PEERS) {
+        let output = Command::new(python)
+            .args([script, "--runs", PEER_RUNS])
+            .args(options)
+            .output()
+            .with_context(|| format!("cannot run {} {script} (from the project's root)", python.display()))?;
+        let text = String::from_utf8_lossy(&output.stdout);
+        match serde_json::from_str(text.lines().last().unwrap_or_default()) {
+            Ok(said) => peer.said = said,
+            Err(_) => {
+                let why = String::from_utf8_lossy(&output.stderr).lines().last().unwrap_or("no output").to_string();
+                tracing::warn!("PyTorch, {}, failed: {why}", peer.name);
+                peer.failed = Some(why);
+                continue;
+            }
+        }
+        let runs = peer.said["seconds"].as_array();
+        peer.seconds.extend(runs.into_iter().flatten().filter_map(serde_json::Value::as_f64));
+        peer.median_s = median(peer.seconds.clone());
+    }
+    Ok(())
 }

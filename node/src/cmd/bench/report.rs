@@ -6,6 +6,7 @@ use serde_json::Value;
 use super::drives::Drives;
 use super::network::Setting;
 use super::pairs::median;
+use super::peers::Peer;
 use super::sizes::{Point, rate};
 use crate::engine::figures::Figures;
 
@@ -24,7 +25,7 @@ pub(super) struct Report {
     pub baselines: Vec<Baseline>,
     pub sizes: Vec<Point>,
     pub world: Value,
-    pub peer_pytorch: Option<Value>,
+    pub peers: Vec<Peer>,
 }
 
 #[derive(Debug, Serialize)]
@@ -75,11 +76,12 @@ impl Report {
     /// The document; the picture lies beside it under this name.
     pub fn markdown(&self, picture: &str) -> String {
         let mut text = format!(
-            "# Run time against error\n\nMade by `{}` on {} ({} threads{}). Times of one run compare with each other; on another \
+            "# Run time against error\n\nMade by `{}` on {} ({} threads, {} kernels{}). Times of one run compare with each other; on another \
              machine make your own.\n\n![run time against error]({picture})\n\n",
             self.command,
             self.machine["cpu"].as_str().unwrap_or("an unknown processor"),
             self.machine["threads"],
+            self.machine["kernels"].as_str().unwrap_or("unknown"),
             self.load.map_or(String::new(), |l| format!(", load {l:.1} when it began")),
         );
         text += &self.settings_table();
@@ -134,26 +136,26 @@ impl Report {
             cells.extend(errors(&s.figures, s.bag_psnr));
             text += &row(&cells);
         }
-        if let Some(peer) = &self.peer_pytorch {
-            let ms = peer["median_s"].as_f64().map(|s| 1e3 * s);
-            let mut cells = vec!["PyTorch, B/8's shapes, f32, eager".to_string(), cell(ms, 1), "-".into()];
-            cells.extend([cell(self.peer_times_less(), 2), cell(ms, 1)]);
+        for peer in self.peers.iter().filter(|peer| peer.median_s.is_some()) {
+            let ms = peer.median_s.map(|s| 1e3 * s);
+            let mut cells = vec![format!("PyTorch, B/8's shapes, {}", peer.name), cell(ms, 1), "-".into()];
+            cells.extend([cell(self.times_less_than(peer), 2), cell(ms, 1)]);
             cells.extend(["-", "-", "-", "7220", "-"].map(String::from));
-            cells.push(cell(peer["peak_rss_mb"].as_f64(), 0));
+            cells.push(cell(peer.said["peak_rss_mb"].as_f64(), 0));
             cells.extend(["-"; 8].map(String::from));
             text += &row(&cells);
         }
         text + "\n"
     }
 
-    /// How many times longer the largest network's default takes than the peer, by the medians: its steps of all rows, for the peer
-    /// was timed before the first and after the last of them.
-    pub fn peer_times_less(&self) -> Option<f64> {
+    /// How many times longer the largest network's default takes than a peer, by the medians: its steps of all rows, for peers
+    /// are timed before the first and after the last of them.
+    pub fn times_less_than(&self, peer: &Peer) -> Option<f64> {
         let of_largest = || self.settings.iter().filter(|s| s.model == super::LARGEST);
         let own = of_largest().filter(|s| s.times_less.is_none()).flat_map(|s| &s.turns_ms.one);
         let beside = of_largest().flat_map(|s| &s.turns_ms.other);
         let ours = median(own.chain(beside).copied().collect())?;
-        Some(ours / 1e3 / self.peer_pytorch.as_ref()?["median_s"].as_f64()?)
+        Some(ours / 1e3 / peer.median_s?)
     }
 
     fn baselines_table(&self) -> String {
@@ -303,6 +305,10 @@ mod tests {
         }
     }
 
+    fn peer(median_s: Option<f64>) -> Peer {
+        Peer { name: "f32, eager", seconds: Vec::new(), median_s, said: Value::Null, failed: None }
+    }
+
     #[test]
     fn tables_are_even_and_the_picture_has_every_setting() {
         let point = |tokens, gflop, network_ms| Point {
@@ -320,7 +326,7 @@ mod tests {
             settings: vec![setting("default", 100.0, 22.5), setting("int8", 60.0, 22.4)],
             baselines: vec![Baseline { method: "static", figures: Figures { ms: Some(90.0), ..Figures::default() } }],
             sizes: vec![point(404, 1.0, 12.0), point(10_388, 100.0, 1000.0)],
-            peer_pytorch: Some(serde_json::json!({"median_s": 26.6})),
+            peers: vec![peer(Some(26.6)), peer(None)],
             ..Report::default()
         };
         let text = report.markdown("bench.svg");
@@ -343,9 +349,8 @@ mod tests {
         let mut int8 = Setting { model: "b8".into(), ..setting("int8", 1.0, 0.0) };
         int8.turns_ms = turns(&[15e3, 15e3], &[21e3, 20e3]);
         let settings = vec![setting("default", 100.0, 22.5), own, int8];
-        let mut report = Report { settings, ..Report::default() };
-        assert_eq!(report.peer_times_less(), None);
-        report.peer_pytorch = Some(serde_json::json!({"median_s": 30.0}));
-        assert_eq!(report.peer_times_less(), Some(0.8), "24 s, not its own row's 25 s nor int8's 15 s");
+        let report = Report { settings, ..Report::default() };
+        assert_eq!(report.times_less_than(&peer(None)), None);
+        assert_eq!(report.times_less_than(&peer(Some(30.0))), Some(0.8), "24 s, not its own row's 25 s nor int8's 15 s");
     }
 }

@@ -19,7 +19,7 @@ pub(super) struct Named {
 type Row = (&'static str, &'static [&'static str], bool);
 
 /// Settings of the network. The first is the configuration's default.
-const NETWORK: [Row; 16] = [
+const NETWORK: [Row; 18] = [
     ("default", &[], true),
     ("bf16", &["model.precision=bf16"], true),
     ("int16", &["model.precision=int16"], true),
@@ -33,6 +33,8 @@ const NETWORK: [Row; 16] = [
     ("int8, tokens merged 25 %", &["model.precision=int8", "skip.merge=0.25"], false),
     ("int8, keys pooled 2x2, merged 25 %", &["model.precision=int8", "skip.kv_pool=2", "skip.merge=0.25"], false),
     ("int8, newest timestep only", &["model.precision=int8", "skip.newest_only=true"], false),
+    ("bf16, newest timestep only", &["model.precision=bf16", "skip.newest_only=true"], false),
+    ("bf16, keys pooled 2x2, merged 25 %", &["model.precision=bf16", "skip.kv_pool=2", "skip.merge=0.25"], false),
     ("3 timesteps", &["window.timesteps=3"], false),
     ("2 timesteps", &["window.timesteps=2"], false),
     ("1 timestep", &["window.timesteps=1"], false),
@@ -42,7 +44,7 @@ const NETWORK: [Row; 16] = [
 const DRIVES: [Row; 6] = [
     ("default", &[], false),
     ("prediction", &["skip.predict=true"], false),
-    ("int8", &["model.precision=int8"], false),
+    ("bf16", &["model.precision=bf16"], false),
     (
         "prediction, contract 1 dB, flow and masks free",
         &["skip.predict=true", "skip.max_psnr_loss_db=1", "skip.max_flow_change=100", "skip.max_mask_change=1"],
