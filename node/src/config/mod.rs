@@ -97,7 +97,7 @@ section! {
         image_height: usize = 0,
         /// Threads for the network and the rasteriser; 0: all cores.
         threads: usize = 0,
-        /// Numbers of the transformer's products: `f32`, `int16` (whole numbers with exact sums), `int8` (the same, weights in 8 bits), `bf16` (rounded as bf16 units would; not faster). On a CPU; elsewhere as they are.
+        /// Numbers of the transformer's products: `f32`, `int16` (whole numbers with exact sums), `int8` (the same, weights in 8 bits), `bf16` (operands rounded to bf16: fastest where the processor has AMX tile units, elsewhere no faster than `f32`). On a CPU; elsewhere as they are.
         precision: String = "f32".into(),
     }
 }

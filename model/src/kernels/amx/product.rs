@@ -2,11 +2,16 @@
 //!
 //! Four tiles hold the sums, two the left operand's step, two the right one's. Tiles are loaded from panels that lie in the
 //! order they are read, so the hardware fetches ahead of itself.
+//!
+//! Every addition in a tile is rounded to f32. Of three parts the five small products are summed first, while the sums are small
+//! and their rounding with them; only the large product's additions then round like a float's. For the same reason longer sums are
+//! added up from several of these ([`product_onto`]).
 
 use std::arch::asm;
 use std::marker::PhantomData;
 
-use super::{Parts, SIDE};
+use super::{Parts, SIDE, TILE};
+use crate::kernels::simd::{Avx512, Simd};
 
 /// What `ldtilecfg` reads: all eight tiles of 16 rows of 64 bytes.
 #[repr(C, align(64))]
@@ -49,32 +54,37 @@ impl Drop for Configured {
     }
 }
 
-/// Sums that start at zero.
-macro_rules! fresh {
-    () => {
-        "tilezero tmm0\n tilezero tmm1\n tilezero tmm2\n tilezero tmm3"
-    };
-}
-
-/// Sums that go on from what is there.
-macro_rules! onto {
-    () => {
-        "tileloadd tmm0, [{c} + {cs}*1]\n tileloadd tmm1, [{c} + {cs}*1 + 64]
-         tileloadd tmm2, [{d} + {cs}*1]\n tileloadd tmm3, [{d} + {cs}*1 + 64]"
-    };
-}
-
-/// The left step's part at this many bytes.
+/// The left step's part at this many bytes from this register.
 macro_rules! left {
-    ($at:literal) => {
-        concat!("tileloadd tmm4, [{a} + {s}*1 + ", $at, "]\n tileloadd tmm5, [{a} + {s}*1 + ", $at, " + 1024]\n")
+    ($from:literal, $at:literal) => {
+        concat!(
+            "tileloadd tmm4, [{",
+            $from,
+            "} + {s}*1 + ",
+            $at,
+            "]\n tileloadd tmm5, [{",
+            $from,
+            "} + {s}*1 + ",
+            $at,
+            " + 1024]\n"
+        )
     };
 }
 
 /// The right step's.
 macro_rules! right {
-    ($at:literal) => {
-        concat!("tileloadd tmm6, [{b} + {s}*1 + ", $at, "]\n tileloadd tmm7, [{b} + {s}*1 + ", $at, " + 1024]\n")
+    ($from:literal, $at:literal) => {
+        concat!(
+            "tileloadd tmm6, [{",
+            $from,
+            "} + {s}*1 + ",
+            $at,
+            "]\n tileloadd tmm7, [{",
+            $from,
+            "} + {s}*1 + ",
+            $at,
+            " + 1024]\n"
+        )
     };
 }
 
@@ -84,46 +94,51 @@ macro_rules! multiply {
     };
 }
 
-/// A step of one part.
-macro_rules! one {
-    () => {
-        concat!(left!(0), right!(0), multiply!(), "add {a}, 2048\n add {b}, 2048\n")
+/// `n` steps of one part, `bytes` apart, from `a` and `b` on.
+macro_rules! large {
+    ($bytes:literal) => {
+        concat!(
+            "3:\n",
+            left!("a", 0),
+            right!("b", 0),
+            multiply!(),
+            "add {a}, ",
+            $bytes,
+            "\n add {b}, ",
+            $bytes,
+            "\n dec {n}\n jnz 3b\n"
+        )
     };
 }
 
-/// A step of three: high, middle and low at 0, 2048 and 4096 bytes. Small products first would be more exact by less than a
-/// rounding, and cost two loads more.
-macro_rules! three {
+/// `m` steps of what is small in products of three parts, which lie at 0, 2048 and 4096 bytes of a step.
+macro_rules! small {
     () => {
         concat!(
-            left!(0),
-            right!(0),
+            "2:\n",
+            left!("e", 0),
+            right!("f", 4096),
             multiply!(),
-            right!(4096),
+            right!("f", 2048),
             multiply!(),
-            right!(2048),
+            left!("e", 2048),
             multiply!(),
-            left!(2048),
+            right!("f", 0),
             multiply!(),
-            right!(0),
+            left!("e", 4096),
             multiply!(),
-            left!(4096),
-            multiply!(),
-            "add {a}, 6144\n add {b}, 6144\n"
+            "add {e}, 6144\n add {f}, 6144\n dec {m}\n jnz 2b\n"
         )
     };
 }
 
 macro_rules! tiles {
-    ($start:expr, $step:expr, $steps:ident, $a:ident, $b:ident, $c:ident, $stride:ident) => {
+    ($loops:expr, $steps:ident, $a:ident, $b:ident, $c:ident, $stride:ident, {$($more:tt)*}) => {
         // SAFETY: the caller's contract; every tile is written before it is read.
         unsafe {
             asm!(
-                $start,
-                "2:",
-                $step,
-                "dec {n}",
-                "jnz 2b",
+                "tilezero tmm0\n tilezero tmm1\n tilezero tmm2\n tilezero tmm3",
+                $loops,
                 "tilestored [{c} + {cs}*1], tmm0",
                 "tilestored [{c} + {cs}*1 + 64], tmm1",
                 "tilestored [{d} + {cs}*1], tmm2",
@@ -132,9 +147,10 @@ macro_rules! tiles {
                 a = inout(reg) $a => _,
                 b = inout(reg) $b => _,
                 c = in(reg) $c,
-                d = in(reg) $c.wrapping_add(SIDE / 2 * $stride),
+                d = in(reg) $c.wrapping_add(TILE * $stride),
                 cs = in(reg) $stride * size_of::<f32>(),
                 s = in(reg) 64usize,
+                $($more)*
                 out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
                 out("tmm4") _, out("tmm5") _, out("tmm6") _, out("tmm7") _,
                 options(nostack),
@@ -157,26 +173,41 @@ pub(in crate::kernels) unsafe fn product(
     stride: usize,
 ) {
     match parts {
-        Parts::One => tiles!(fresh!(), one!(), steps, a, b, c, stride),
-        Parts::Three => tiles!(fresh!(), three!(), steps, a, b, c, stride),
+        Parts::One => tiles!(large!(2048), steps, a, b, c, stride, {}),
+        Parts::Three => tiles!(concat!(small!(), large!(6144)), steps, a, b, c, stride, {
+            m = inout(reg) steps => _, e = inout(reg) a => _, f = inout(reg) b => _,
+        }),
     }
 }
+
+/// 32x32 floats in a cache line's place.
+#[repr(C, align(64))]
+struct Sums([f32; SIDE * SIDE]);
 
 /// `c += a b`, else as [`product`].
 ///
 /// # Safety
-/// As there, and `c` is readable.
+/// As there, `c` is readable, and the caller is compiled for AVX-512.
 #[inline(always)]
 pub(in crate::kernels) unsafe fn product_onto(
-    _tiles: &Configured,
+    tiles: &Configured,
     parts: Parts,
     steps: usize,
-    (a, b): (*const f32, *const f32),
+    both: (*const f32, *const f32),
     c: *mut f32,
     stride: usize,
 ) {
-    match parts {
-        Parts::One => tiles!(onto!(), one!(), steps, a, b, c, stride),
-        Parts::Three => tiles!(onto!(), three!(), steps, a, b, c, stride),
+    type V = Avx512<true>;
+    let mut sums = std::mem::MaybeUninit::<Sums>::uninit();
+    let from = sums.as_mut_ptr().cast::<f32>();
+    // SAFETY: the caller's contract; `sums` has 32 rows of 32 floats, all of them written by the product.
+    unsafe {
+        product(tiles, parts, steps, both, from, SIDE);
+        for row in 0..SIDE {
+            for half in [0, V::W] {
+                let to = c.add(row * stride + half);
+                V::store(to, V::add(V::load(to), V::load(from.add(row * SIDE + half))));
+            }
+        }
     }
 }

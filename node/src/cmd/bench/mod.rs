@@ -7,6 +7,7 @@ mod network;
 mod pairs;
 mod peers;
 mod picture;
+mod repeat;
 mod report;
 mod settings;
 mod sizes;
@@ -85,6 +86,9 @@ pub struct Args {
     /// A Python with PyTorch: times tests/python/peer_network.py at B/8's size in the same run, in f32 and bf16, eager and compiled.
     #[arg(long)]
     peer_python: Option<PathBuf>,
+    /// JSON of an earlier bench: says how many of the ratios both have are within 10 % of each other.
+    #[arg(long)]
+    against: Option<PathBuf>,
 }
 
 /// An argument as a document shows it: of a path from the root, which is this machine's own affair, the last part.
@@ -118,6 +122,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             row.config(model)?;
         }
     }
+    let earlier = args.against.as_deref().map(read_json).transpose()?;
     let sizes = if args.sizes { sizes::plan(args.largest) } else { Vec::new() };
     let steps = models.len() * network_rows.len() + 10 * drive_rows.len() + sizes.len() + args.clips + 1;
     let bar = progress_bar(progress, steps as u64, "measuring");
@@ -228,6 +233,14 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             say!("ours in f32 {:.1} s: {ratio:.2} of it", ratio * seconds);
         }
     }
+    if let Some(earlier) = &earlier {
+        let repeat = repeat::compare(earlier, &serde_json::to_value(&report)?);
+        say!("{} of {} ratios are within 10 % of the earlier bench's", repeat.near, repeat.compared);
+        for (name, before, now) in &repeat.far {
+            say!("  {name}: {before:.2} then, {now:.2} now");
+        }
+        report.repeat = Some(repeat);
+    }
     write(args, &report)?;
     Ok(Outcome::Done)
 }
@@ -238,6 +251,11 @@ fn time_peers(python: Option<&PathBuf>, report: &mut Report, bar: &ProgressBar) 
         peers::time_peers(python, &mut report.peers)?;
     }
     Ok(())
+}
+
+fn read_json(path: &Path) -> Result<serde_json::Value> {
+    let read = std::fs::read(path).map_err(anyhow::Error::from).and_then(|text| Ok(serde_json::from_slice(&text)?));
+    read.map_err(|e| UsageError(format!("{} is no bench's JSON: {e}", path.display())).into())
 }
 
 fn write(args: &Args, report: &Report) -> Result<()> {

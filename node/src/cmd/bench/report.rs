@@ -7,6 +7,7 @@ use super::drives::Drives;
 use super::network::Setting;
 use super::pairs::median;
 use super::peers::Peer;
+use super::repeat::Repeat;
 use super::sizes::{Point, rate};
 use crate::engine::figures::Figures;
 
@@ -26,6 +27,9 @@ pub(super) struct Report {
     pub sizes: Vec<Point>,
     pub world: Value,
     pub peers: Vec<Peer>,
+    /// Beside an earlier bench.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub repeat: Option<Repeat>,
 }
 
 #[derive(Debug, Serialize)]
