@@ -17,6 +17,7 @@ use candle_core::Device;
 use storm_model::config::ModelConfig;
 use storm_model::scene::{RenderedView, Scene, Want};
 use storm_model::weights::{self, Tensors};
+use storm_model::kernels::Isa;
 use storm_model::{ClipBatch, ModelError, PixelLayout, Precision, Shortcuts, Storm, ViewInput};
 use storm_render::raster::{CpuRasterizer, RasterSettings};
 use storm_render::{Intrinsics, View};
@@ -139,8 +140,8 @@ impl Engine {
         };
         let raster = CpuRasterizer::new(model.config().raster_settings())?;
         let shortcuts = Shortcuts { precision: section.precision.parse()?, ..Shortcuts::default() };
-        if shortcuts.precision == Precision::Bf16 {
-            warn!("model.precision = bf16 rounds as bf16 units would, in f32 arithmetic: it is not faster than f32");
+        if shortcuts.precision == Precision::Bf16 && Isa::detect() != Isa::Amx {
+            warn!("model.precision = bf16 without AMX tile units rounds in f32 arithmetic: it is no faster than f32; use int16");
         }
         let sky = SkyPatches::new(&SkipConfig::default(), model.config().patch_size);
         let reuse = Reuse::new(0);
