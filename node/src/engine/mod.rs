@@ -15,9 +15,9 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use candle_core::Device;
 use storm_model::config::ModelConfig;
+use storm_model::kernels::Isa;
 use storm_model::scene::{RenderedView, Scene, Want};
 use storm_model::weights::{self, Tensors};
-use storm_model::kernels::Isa;
 use storm_model::{ClipBatch, ModelError, PixelLayout, Precision, Shortcuts, Storm, ViewInput};
 use storm_render::raster::{CpuRasterizer, RasterSettings};
 use storm_render::{Intrinsics, View};
@@ -141,7 +141,9 @@ impl Engine {
         let raster = CpuRasterizer::new(model.config().raster_settings())?;
         let shortcuts = Shortcuts { precision: section.precision.parse()?, ..Shortcuts::default() };
         if shortcuts.precision == Precision::Bf16 && Isa::detect() != Isa::Amx {
-            warn!("model.precision = bf16 without AMX tile units rounds in f32 arithmetic: it is no faster than f32; use int16");
+            warn!(
+                "model.precision = bf16 without AMX tile units rounds in f32 arithmetic: it is no faster than f32; use int16"
+            );
         }
         let sky = SkyPatches::new(&SkipConfig::default(), model.config().patch_size);
         let reuse = Reuse::new(0);

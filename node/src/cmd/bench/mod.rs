@@ -290,7 +290,8 @@ fn machine() -> serde_json::Value {
     };
     let flags = field("flags");
     let has = |f: &&str| flags.split(' ').any(|x| x == *f);
-    let simd: Vec<&str> = ["avx2", "fma", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16"].into_iter().filter(has).collect();
+    let simd: Vec<&str> =
+        ["avx2", "fma", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16"].into_iter().filter(has).collect();
     let kernels = format!("{:?}", storm_model::kernels::Isa::detect());
     json!({"cpu": field("model name"), "threads": rayon::current_num_threads(), "simd": simd, "kernels": kernels, "version": env!("CARGO_PKG_VERSION")})
 }

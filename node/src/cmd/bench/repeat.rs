@@ -42,7 +42,8 @@ fn ratios(bench: &Value) -> BTreeMap<String, f64> {
         }
     }
     for p in list(bench, "sizes") {
-        let name = format!("{}: {} timesteps, {} cameras, {}", text(&p, "curve"), p["timesteps"], p["cameras"], p["picture"]);
+        let name =
+            format!("{}: {} timesteps, {} cameras, {}", text(&p, "curve"), p["timesteps"], p["cameras"], p["picture"]);
         put(name, p["times_usual"].as_f64());
     }
     for peer in list(bench, "peers") {

@@ -355,6 +355,10 @@ mod tests {
         let settings = vec![setting("default", 100.0, 22.5), own, int8];
         let report = Report { settings, ..Report::default() };
         assert_eq!(report.times_less_than(&peer(None)), None);
-        assert_eq!(report.times_less_than(&peer(Some(30.0))), Some(0.8), "24 s, not its own row's 25 s nor int8's 15 s");
+        assert_eq!(
+            report.times_less_than(&peer(Some(30.0))),
+            Some(0.8),
+            "24 s, not its own row's 25 s nor int8's 15 s"
+        );
     }
 }
