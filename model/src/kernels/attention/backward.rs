@@ -9,10 +9,11 @@ use std::cell::RefCell;
 
 use rayon::prelude::*;
 
+use super::Output;
 use super::pack::{Head, Shape};
-use super::{Output, tile};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
+use crate::kernels::gemm::tile;
 use crate::kernels::math::exp2;
 use crate::kernels::simd::{Kernel, Simd, dispatch};
 

@@ -10,8 +10,9 @@ use std::cell::{Cell, RefCell};
 
 use rayon::prelude::*;
 
+use super::block::{put_row, start_at};
 use super::pack::{Inputs, Layout, Shape, Source, larger, logit_scale};
-use super::{BLOCK_KEYS, BLOCK_QUERIES, Output, put_row, start_at, whole_blocks};
+use super::{BLOCK_KEYS, BLOCK_QUERIES, Output, whole_blocks};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
 use crate::kernels::gemm::integer::{factors_of, largest_of, quantise, row_factors};
