@@ -3,7 +3,7 @@
 //! Blocking, from the inside out (the usual one, after Goto and van de Geijn, "Anatomy of High-Performance Matrix
 //! Multiplication", 2008): a tile of `tile_rows x tile_cols` accumulators stays in registers over `panel_depth`
 //! products; its right-hand panel (16 KiB) stays in the first-level cache while all row panels of the block pass by;
-//! the block of `x` (at most [`block_rows`]) is packed once and stays in the second level; partial sums wait in a
+//! the block of `x` (at most `block_rows`) is packed once and stays in the second level; partial sums wait in a
 //! block `BLOCK_COLS` wide. Weights are packed once per layer ([`PackedWeight`]).
 //!
 //! Every output is summed in the order of `k`, in blocks fixed by `k` alone: neither the split over threads nor the

@@ -46,7 +46,7 @@ pub(super) enum Numbers {
     Tiles(Parts),
 }
 
-/// A weight `(n, k)` laid out as the kernel reads it (on tile units: [`crate::kernels::amx`]); elsewhere per panel of `tile_cols` outputs, `k` rows of that many floats (or
+/// A weight `(n, k)` laid out as the kernel reads it (on tile units as `kernels::amx` says); elsewhere per panel of `tile_cols` outputs, `k` rows of that many floats (or
 /// half as many rows of pairs of whole numbers), zeros past `n`.
 #[derive(Debug)]
 pub struct PackedWeight {
