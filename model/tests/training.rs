@@ -3,7 +3,7 @@
 
 use candle_core::Device;
 use storm_model::ModelConfig;
-use storm_model::train::{ClipOptions, TrainError, TrainOptions, Trainer};
+use storm_model::train::{ClipOptions, Stage, TrainError, TrainOptions, Trainer};
 use storm_model::weights::untrained;
 
 fn config() -> ModelConfig {
@@ -39,6 +39,24 @@ fn train(trainer: &mut Trainer, steps: u64) -> Vec<f64> {
             trainer.step(&clip).unwrap().total
         })
         .collect()
+}
+
+#[test]
+fn clips_are_learned_from_alike_on_any_number_of_threads() {
+    let run = |threads: usize| {
+        let options = TrainOptions { batch: 5, stage: Stage::Both, one_camera_steps: 0, ..options(3) };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut trainer = trainer(options);
+            let losses = train(&mut trainer, 3);
+            let weights = trainer.weights(false).unwrap();
+            let bits = |x: &candle_core::Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            let weights: Vec<u32> = weights.values().flat_map(bits).map(f32::to_bits).collect();
+            (losses, weights)
+        })
+    };
+    let one = run(1);
+    assert!(one.0.iter().all(|x| x.is_finite()) && one == run(3));
 }
 
 #[test]

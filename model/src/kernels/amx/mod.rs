@@ -3,7 +3,7 @@
 //! A float of 24 bits is, exactly, the sum of three bf16 of 8: its leading bits, those after, and the rest ([`split`]).
 //! Products of floats are therefore sums of products of parts. With [`Parts::Three`] the six products that are not below a
 //! float's own rounding are taken (high x high, high x middle, middle x high, high x low, middle x middle, low x high), and
-//! what is left out is at most `2^-22` of each product: results are those of f32 arithmetic, to its own rounding (Henry, Tang and Heinecke,
+//! what is left out is at most `2^-21` of each product: results are those of f32 arithmetic, to its own rounding (Henry, Tang and Heinecke,
 //! "Leveraging the bfloat16 Artificial Intelligence Datatype For Higher-Precision Computations", 2019). With [`Parts::One`]
 //! operands are rounded to bf16 and multiplied once.
 //!

@@ -145,6 +145,26 @@ fn whole_blocks(inputs: &Inputs<'_>) -> Option<(Vec<f32>, f32)> {
     Some((padded, largest))
 }
 
+/// The largest of each head's blocks.
+fn by_head(sizes: &[Sizes], blocks: usize) -> Vec<Sizes> {
+    sizes.chunks_exact(blocks).map(|head| head.iter().copied().reduce(Sizes::or).unwrap_or_default()).collect()
+}
+
+/// Runs `task` for every `rows` queries of every head, in parallel; it is told which head of all sequences' it is.
+fn each_query_block<'a>(
+    inputs: &'a Inputs<'a>,
+    shape: &'a Shape,
+    rows: usize,
+    task: impl Fn(Source<'a>, usize) + Sync + Send,
+) {
+    let query_blocks = shape.tokens.div_ceil(rows);
+    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {
+        let (head_index, query_block) = (index / query_blocks, index % query_blocks);
+        let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
+        task(Source { inputs, shape, batch, head, first: query_block * rows }, head_index);
+    });
+}
+
 fn run(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32], log_sums: Option<Output>) {
     inputs.check(&shape);
     assert_eq!(out.len(), shape.batch * shape.tokens * shape.width(), "output of {shape:?}");
@@ -167,16 +187,9 @@ fn run(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut [f32], log_sums: O
         *sizes = pack(inputs, &shape, &layout, index, block);
     });
     let packed = &*packed;
-    let sizes: Vec<Sizes> = sizes
-        .chunks_exact(layout.blocks)
-        .map(|head| head.iter().copied().reduce(Sizes::or).unwrap_or_default())
-        .collect();
-    let query_blocks = shape.tokens.div_ceil(BLOCK_QUERIES);
+    let sizes = by_head(&sizes, layout.blocks);
     let output = Output { start: out.as_mut_ptr(), len: out.len() };
-    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {
-        let (head_index, query_block) = (index / query_blocks, index % query_blocks);
-        let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
-        let source = Source { inputs, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
+    each_query_block(inputs, &shape, BLOCK_QUERIES, |source, head_index| {
         let blocks = &packed[head_index * head_floats..][..head_floats];
         // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
         SCRATCH.with_borrow_mut(|scratch| {

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use super::block::{put_row, start_at};
 use super::pack::{Inputs, Layout, Shape, Source, larger, logit_scale};
-use super::{BLOCK_KEYS, BLOCK_QUERIES, Output, whole_blocks};
+use super::{BLOCK_KEYS, BLOCK_QUERIES, Output, each_query_block, whole_blocks};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
 use crate::kernels::gemm::integer::{factors_of, largest_of, quantise, row_factors};
@@ -315,12 +315,8 @@ pub fn attention_in_pairs(isa: Isa, inputs: &Inputs<'_>, shape: Shape, out: &mut
         });
     });
     let packed = &*packed;
-    let query_blocks = shape.tokens.div_ceil(BLOCK_QUERIES);
     let output = Output { start: out.as_mut_ptr(), len: out.len() };
-    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {
-        let (head_index, query_block) = (index / query_blocks, index % query_blocks);
-        let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
-        let source = Source { inputs, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
+    each_query_block(inputs, &shape, BLOCK_QUERIES, |source, head_index| {
         let blocks = &packed[head_index * head_floats..][..head_floats];
         let scales = &scales[head_index * layout.blocks..][..layout.blocks];
         // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.

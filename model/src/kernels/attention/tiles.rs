@@ -8,7 +8,7 @@ use std::cell::RefCell;
 use rayon::prelude::*;
 
 use super::pack::{Inputs, Shape, Sizes, Source, larger, logit_scale, squares};
-use super::{BLOCK_KEYS, FLAT_LOGITS, FLAT_VALUES, Output, PACKED, whole_blocks};
+use super::{BLOCK_KEYS, FLAT_LOGITS, FLAT_VALUES, Output, PACKED, by_head, each_query_block, whole_blocks};
 use crate::kernels::aligned::Aligned;
 use crate::kernels::amx::{
     Configured, Parts, SIDE, STEP, TILE, TILE_FLOATS, column_tiles, product, product_onto, row_tiles, transpose,
@@ -364,16 +364,9 @@ pub(super) fn run(parts: Parts, inputs: &Inputs<'_>, shape: Shape, out: &mut [f3
         *sizes = pack(inputs, &shape, &layout, index, block);
     });
     let packed = &*packed;
-    let sizes: Vec<Sizes> = sizes
-        .chunks_exact(layout.blocks)
-        .map(|head| head.iter().copied().reduce(Sizes::or).unwrap_or_default())
-        .collect();
-    let query_blocks = shape.tokens.div_ceil(BLOCK_QUERIES);
+    let sizes = by_head(&sizes, layout.blocks);
     let output = Output { start: out.as_mut_ptr(), len: out.len() };
-    (0..shape.batch * shape.heads * query_blocks).into_par_iter().for_each(|index| {
-        let (head_index, query_block) = (index / query_blocks, index % query_blocks);
-        let (batch, head) = (head_index / shape.heads, head_index % shape.heads);
-        let source = Source { inputs, shape: &shape, batch, head, first: query_block * BLOCK_QUERIES };
+    each_query_block(inputs, &shape, BLOCK_QUERIES, |source, head_index| {
         let blocks = &packed[head_index * head_floats..][..head_floats];
         // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
         SCRATCH.with_borrow_mut(|scratch| {
