@@ -61,6 +61,19 @@ fn wrong_usage_is_exit_code_1_and_names_what_is_wrong() {
     assert_eq!(code(&storm(&["--version"])), 0);
 }
 
+#[test]
+fn an_instruction_set_that_is_not_there_is_refused() {
+    let config = |isa| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_storm"));
+        command.arg("config").env("STORM_ISA", isa).output().expect("the program starts")
+    };
+    let refused = config("mmx");
+    assert_eq!(code(&refused), 1);
+    assert!(stderr(&refused).contains("STORM_ISA=mmx: this machine has portable"), "{}", stderr(&refused));
+    assert_eq!(code(&config("portable")), 0);
+    assert_eq!(code(&config("")), 0);
+}
+
 /// Built without ROS 2 the program says how to come by it.
 #[cfg(not(feature = "ros"))]
 #[test]

@@ -43,14 +43,32 @@ pub enum Isa {
 
 impl Isa {
     /// The widest set this machine runs, or the one that `STORM_ISA` names (`portable`, `avx2`, `avx512`, `amx`: to measure one, or
-    /// to get another machine's bits) where the machine has it; looked up once.
+    /// to get another machine's bits) where the machine has it ([`Isa::asked_for`] says when not); looked up once.
     pub fn detect() -> Self {
         static FOUND: OnceLock<Isa> = OnceLock::new();
         *FOUND.get_or_init(|| {
-            let sets = Self::available();
-            let asked = std::env::var("STORM_ISA").unwrap_or_default();
-            let named = sets.iter().find(|isa| format!("{isa:?}").eq_ignore_ascii_case(&asked));
-            named.or(sets.last()).copied().unwrap_or(Isa::Portable)
+            let widest = Self::available().last().copied().unwrap_or(Isa::Portable);
+            Self::asked_for().ok().flatten().unwrap_or(widest)
+        })
+    }
+
+    /// The set that `STORM_ISA` names; none where it is empty or not there.
+    ///
+    /// # Errors
+    /// When it names something else than one of this machine's sets.
+    pub fn asked_for() -> Result<Option<Self>, String> {
+        Self::named(&std::env::var("STORM_ISA").unwrap_or_default(), &Self::available())
+    }
+
+    fn named(name: &str, sets: &[Self]) -> Result<Option<Self>, String> {
+        if name.is_empty() {
+            return Ok(None);
+        }
+        let names: Vec<_> = sets.iter().map(|isa| format!("{isa:?}").to_lowercase()).collect();
+        let found = names.iter().position(|have| have.eq_ignore_ascii_case(name));
+        found.map(|i| Some(sets[i])).ok_or_else(|| {
+            let have = names.join(", ");
+            format!("STORM_ISA={name}: this machine has {have}; name one of them, or leave STORM_ISA empty for the last")
         })
     }
 
@@ -134,6 +152,17 @@ pub(crate) mod tests {
         use rand::{RngExt, SeedableRng};
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
         (0..len).map(|_| rng.random_range(-scale..scale)).collect()
+    }
+
+    #[test]
+    fn a_set_is_named_or_refused() {
+        let sets = [Isa::Portable, Isa::Avx2];
+        assert_eq!(Isa::named("", &sets), Ok(None));
+        assert_eq!(Isa::named("AVX2", &sets), Ok(Some(Isa::Avx2)));
+        for missing in ["amx", "avx", "2"] {
+            let said = Isa::named(missing, &sets).unwrap_err();
+            assert!(said.contains(missing) && said.contains("portable, avx2"), "{said}");
+        }
     }
 
     /// Largest absolute difference, infinite for NaN.

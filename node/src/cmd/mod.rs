@@ -107,6 +107,10 @@ impl Cli {
     /// Runs the command; errors are printed as one line on stderr.
     pub fn run(self) -> Outcome {
         start_log(self.quiet);
+        if let Err(e) = storm_model::kernels::Isa::asked_for() {
+            complain!("error: {e}");
+            return Outcome::Usage;
+        }
         let progress = !self.quiet && std::io::stderr().is_terminal();
         let result = match self.command {
             Command::Demo(a) => demo::run(&a, progress),

@@ -226,10 +226,11 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let peer = args.peer_python.as_ref().filter(|_| report.peers.is_empty());
     time_peers(peer, &mut report, &bar)?;
     bar.finish_and_clear();
+    report.compare_peers();
     for peer in &report.peers {
         let Some(seconds) = peer.median_s else { continue };
         say!("PyTorch, {}, at B/8's size: {seconds:.1} s", peer.name);
-        if let Some(ratio) = report.times_less_than(peer) {
+        if let Some(ratio) = peer.times_less {
             say!("ours in f32 {:.1} s: {ratio:.2} of it", ratio * seconds);
         }
     }

@@ -73,6 +73,8 @@ pub(super) struct Peer {
     /// Every run.
     pub seconds: Vec<f64>,
     pub median_s: Option<f64>,
+    /// How many times longer the largest network's default takes.
+    pub times_less: Option<f64>,
     /// What it said of itself the last time.
     pub said: serde_json::Value,
     /// Why it gave no figures.
@@ -82,7 +84,7 @@ pub(super) struct Peer {
 /// Every way of running PyTorch: two more runs to those before. A way that fails (compiling wants a C++ compiler) says so.
 pub(super) fn time_peers(python: &Path, peers: &mut Vec<Peer>) -> Result<()> {
     if peers.is_empty() {
-        let new = |name| Peer { name, seconds: Vec::new(), median_s: None, said: json!(null), failed: None };
+        let new = |name| Peer { name, seconds: Vec::new(), median_s: None, times_less: None, said: json!(null), failed: None };
         peers.extend(PEERS.map(|(name, _)| new(name)));
     }
     let script = "tests/python/peer_network.py";

@@ -28,13 +28,8 @@ fn ratios(bench: &Value) -> BTreeMap<String, f64> {
             all.insert(name, ratio);
         }
     };
-    let mut largest_ms = None;
     for s in list(bench, "settings") {
-        let (model, setting) = (text(&s, "model"), text(&s, "setting"));
-        if model == super::LARGEST && setting == "default" {
-            largest_ms = s["step_ms"]["p50"].as_f64();
-        }
-        put(format!("{model}, {setting}"), s["times_less"].as_f64());
+        put(format!("{}, {}", text(&s, "model"), text(&s, "setting")), s["times_less"].as_f64());
     }
     for setting in list(bench, "drives") {
         for row in list(&setting, "rows") {
@@ -47,8 +42,7 @@ fn ratios(bench: &Value) -> BTreeMap<String, f64> {
         put(name, p["times_usual"].as_f64());
     }
     for peer in list(bench, "peers") {
-        let ratio = largest_ms.zip(peer["median_s"].as_f64()).map(|(ours, s)| ours / 1e3 / s);
-        put(format!("PyTorch, {}", text(&peer, "name")), ratio);
+        put(format!("PyTorch, {}", text(&peer, "name")), peer["times_less"].as_f64());
     }
     all
 }
@@ -76,7 +70,7 @@ mod tests {
                 {"model": "b8", "setting": "int8", "times_less": int8, "step_ms": {"p50": 4000.0}},
             ],
             "drives": [{"setting": "default", "rows": [{"drive": "standing", "ratio": standing}]}],
-            "peers": [{"name": "f32, eager", "median_s": peer}, {"name": "f32, compiled", "median_s": null}],
+            "peers": [{"name": "f32, eager", "times_less": peer}, {"name": "f32, compiled", "times_less": null}],
         })
     }
 

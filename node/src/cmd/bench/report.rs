@@ -143,7 +143,7 @@ impl Report {
         for peer in self.peers.iter().filter(|peer| peer.median_s.is_some()) {
             let ms = peer.median_s.map(|s| 1e3 * s);
             let mut cells = vec![format!("PyTorch, B/8's shapes, {}", peer.name), cell(ms, 1), "-".into()];
-            cells.extend([cell(self.times_less_than(peer), 2), cell(ms, 1)]);
+            cells.extend([cell(peer.times_less, 2), cell(ms, 1)]);
             cells.extend(["-", "-", "-", "7220", "-"].map(String::from));
             cells.push(cell(peer.said["peak_rss_mb"].as_f64(), 0));
             cells.extend(["-"; 8].map(String::from));
@@ -152,14 +152,16 @@ impl Report {
         text + "\n"
     }
 
-    /// How many times longer the largest network's default takes than a peer, by the medians: its steps of all rows, for peers
-    /// are timed before the first and after the last of them.
-    pub fn times_less_than(&self, peer: &Peer) -> Option<f64> {
+    /// Sets each peer's `times_less`, by the medians: steps of the largest network's default from all rows, for peers are
+    /// timed before the first and after the last of them.
+    pub fn compare_peers(&mut self) {
         let of_largest = || self.settings.iter().filter(|s| s.model == super::LARGEST);
         let own = of_largest().filter(|s| s.times_less.is_none()).flat_map(|s| &s.turns_ms.one);
         let beside = of_largest().flat_map(|s| &s.turns_ms.other);
-        let ours = median(own.chain(beside).copied().collect())?;
-        Some(ours / 1e3 / peer.median_s?)
+        let ours = median(own.chain(beside).copied().collect());
+        for peer in &mut self.peers {
+            peer.times_less = ours.zip(peer.median_s).map(|(ms, s)| ms / 1e3 / s);
+        }
     }
 
     fn baselines_table(&self) -> String {
@@ -310,7 +312,7 @@ mod tests {
     }
 
     fn peer(median_s: Option<f64>) -> Peer {
-        Peer { name: "f32, eager", seconds: Vec::new(), median_s, said: Value::Null, failed: None }
+        Peer { name: "f32, eager", seconds: Vec::new(), median_s, times_less: None, said: Value::Null, failed: None }
     }
 
     #[test]
@@ -353,12 +355,9 @@ mod tests {
         let mut int8 = Setting { model: "b8".into(), ..setting("int8", 1.0, 0.0) };
         int8.turns_ms = turns(&[15e3, 15e3], &[21e3, 20e3]);
         let settings = vec![setting("default", 100.0, 22.5), own, int8];
-        let report = Report { settings, ..Report::default() };
-        assert_eq!(report.times_less_than(&peer(None)), None);
-        assert_eq!(
-            report.times_less_than(&peer(Some(30.0))),
-            Some(0.8),
-            "24 s, not its own row's 25 s nor int8's 15 s"
-        );
+        let mut report = Report { settings, peers: vec![peer(None), peer(Some(30.0))], ..Report::default() };
+        report.compare_peers();
+        let ratios: Vec<_> = report.peers.iter().map(|peer| peer.times_less).collect();
+        assert_eq!(ratios, [None, Some(0.8)], "24 s, not its own row's 25 s nor int8's 15 s");
     }
 }
