@@ -68,7 +68,9 @@ impl Isa {
         let found = names.iter().position(|have| have.eq_ignore_ascii_case(name));
         found.map(|i| Some(sets[i])).ok_or_else(|| {
             let have = names.join(", ");
-            format!("STORM_ISA={name}: this machine has {have}; name one of them, or leave STORM_ISA empty for the last")
+            format!(
+                "STORM_ISA={name}: this machine has {have}; name one of them, or leave STORM_ISA empty for the last"
+            )
         })
     }
 

@@ -1,5 +1,15 @@
 //! What a process asks of the C library's allocator, and one that trains of candle's threads.
 
+use std::mem::MaybeUninit;
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+/// Floats that are cleared by all threads: from 1 MB, to where glibc maps blocks one by one (those are clear when they come).
+const SHARED_CLEARING: Range<usize> = 1 << 18..8 << 20;
+/// Floats of such a block that a thread clears at a time.
+const CLEARED_AT_A_TIME: usize = 1 << 16;
+
 /// Environment variable with the number of threads of candle's own pool.
 const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
 
@@ -43,7 +53,18 @@ pub fn share_one_heap() {
 
 /// Zeros for a result. On Linux large ones are asked for in large pages: blocks of this size are fetched from the system and handed
 /// back each time, and with pages of 4 KiB that takes longer than many a kernel that fills them.
+///
+/// Those of middling size usually lie in memory that was used before and has to be cleared, which all threads do together: as much
+/// as it is, one thread's memory traffic takes longer than many a kernel.
 pub(super) fn zeros(len: usize) -> Vec<f32> {
+    if SHARED_CLEARING.contains(&len) {
+        let mut values = Vec::with_capacity(len);
+        let places = &mut values.spare_capacity_mut()[..len];
+        places.par_chunks_mut(CLEARED_AT_A_TIME).for_each(|part| part.fill(MaybeUninit::new(0.0)));
+        // SAFETY: all of them were just written.
+        unsafe { values.set_len(len) };
+        return values;
+    }
     let values = vec![0f32; len];
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     glibc::use_large_pages(&values);

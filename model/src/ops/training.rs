@@ -6,6 +6,7 @@
 use candle_core::{Result, Tensor};
 
 use super::graph::{Backward, node};
+use super::process::zeros;
 use super::{Activation, Linear};
 use crate::kernels::attention::{BackwardSource, Shape, attention_backward, attention_keeping};
 use crate::kernels::gemm::{self, Epilogue, MlpGradients, PackedWeight};
@@ -20,7 +21,7 @@ fn values(tensor: &Tensor) -> Result<Vec<f32>> {
 
 /// Runs `f` on zeros of the shape of `like`, and makes them a tensor.
 fn filled(like: &Tensor, f: impl FnOnce(&mut [f32]) -> Result<()>) -> Result<Tensor> {
-    let mut out = vec![0f32; like.elem_count()];
+    let mut out = zeros(like.elem_count());
     f(&mut out)?;
     Tensor::from_vec(out, like.dims(), like.device())
 }
@@ -105,7 +106,7 @@ pub(super) fn linear(
     residual: Option<&Tensor>,
     dims: &[usize],
 ) -> Result<Tensor> {
-    let mut out = vec![0f32; dims.iter().product()];
+    let mut out = zeros(dims.iter().product());
     let before = with_values(x, |x| {
         with_optional(residual, |residual| {
             layer.with_parts(|packed, bias| {
@@ -113,7 +114,7 @@ pub(super) fn linear(
                     gemm::linear(x, packed, Epilogue { bias, act, residual }, &mut out);
                     return Ok(None);
                 }
-                let mut before = vec![0f32; out.len()];
+                let mut before = zeros(out.len());
                 gemm::linear(x, packed, Epilogue { bias, ..NOTHING }, &mut before);
                 rows::activate(Isa::detect(), act, &before, residual, &mut out);
                 Ok(Some(before))
@@ -142,7 +143,7 @@ impl Backward for MlpBackward {
     fn gradients(&self, _: &Tensor, grad: &Tensor) -> Result<Vec<Option<Tensor>>> {
         let ((hidden, k), n) = (self.first.weight.dims2()?, self.second.weight.dim(0)?);
         let (m, _) = matrix(&self.x);
-        let wanted = |tensor: &Tensor| tensor.track_op().then(|| vec![0f32; tensor.elem_count()]);
+        let wanted = |tensor: &Tensor| tensor.track_op().then(|| zeros(tensor.elem_count()));
         let (mut x, mut w1, mut w2) = (wanted(&self.x), wanted(&self.first.weight), wanted(&self.second.weight));
         let biases = [&self.first.bias, &self.second.bias].map(|b| b.as_ref().filter(|b| b.track_op()));
         let mut b1 = biases[0].map(|_| Vec::new());
@@ -181,8 +182,8 @@ pub(super) fn mlp(
     dims: &[usize],
 ) -> Result<Tensor> {
     let hidden = first.weight.dim(0)?;
-    let mut out = vec![0f32; dims.iter().product()];
-    let mut before = vec![0f32; matrix(x).0 * hidden];
+    let mut out = zeros(dims.iter().product());
+    let mut before = zeros(matrix(x).0 * hidden);
     with_values(x, |x| {
         with_optional(residual, |residual| {
             first.with_parts(|w1, bias| {
@@ -227,7 +228,7 @@ impl Backward for AttentionBackward {
 /// See [`super::attention`].
 pub(super) fn attention(qkv: &Tensor, shape: Shape) -> Result<Tensor> {
     let width = shape.heads * shape.head_dim;
-    let mut out = vec![0f32; shape.batch * shape.tokens * width];
+    let mut out = zeros(shape.batch * shape.tokens * width);
     let log_sums = with_values(qkv, |values| Ok(attention_keeping(Isa::detect(), values, shape, &mut out)))?;
     let kept = AttentionBackward { qkv: qkv.clone(), shape, log_sums };
     node(out, (shape.batch, shape.tokens, width), &[Some(qkv)], kept)
@@ -265,7 +266,7 @@ impl Backward for NormBackward {
 /// See [`super::layer_norm`].
 pub(super) fn layer_norm(x: &Tensor, weight: Option<&Tensor>, bias: Option<&Tensor>, eps: f64) -> Result<Tensor> {
     let (_, width) = matrix(x);
-    let mut out = vec![0f32; x.elem_count()];
+    let mut out = zeros(x.elem_count());
     let statistics = with_values(x, |x| {
         with_optional(weight, |weight| {
             with_optional(bias, |bias| {
@@ -299,7 +300,7 @@ impl Backward for MapBackward {
 
 /// `act` of every element.
 pub(super) fn map(x: &Tensor, act: Activation) -> Result<Tensor> {
-    let mut out = vec![0f32; x.elem_count()];
+    let mut out = zeros(x.elem_count());
     with_values(x, |x| {
         rows::activate(Isa::detect(), act, x, None, &mut out);
         Ok(())
@@ -328,7 +329,7 @@ impl Backward for SoftmaxBackward {
 
 /// See [`super::softmax`].
 pub(super) fn softmax(x: &Tensor, tau: f64) -> Result<Tensor> {
-    let mut out = vec![0f32; x.elem_count()];
+    let mut out = zeros(x.elem_count());
     with_values(x, |values| {
         rows::softmax(Isa::detect(), values, matrix(x).1, tau as f32, &mut out);
         Ok(())

@@ -5,7 +5,8 @@
 //! float's own rounding are taken (high x high, high x middle, middle x high, high x low, middle x middle, low x high), and
 //! what is left out is at most `2^-21` of each product: results are those of f32 arithmetic, to its own rounding (Henry, Tang and Heinecke,
 //! "Leveraging the bfloat16 Artificial Intelligence Datatype For Higher-Precision Computations", 2019). With [`Parts::One`]
-//! operands are rounded to bf16 and multiplied once.
+//! operands are rounded to bf16 and multiplied once. Between them lie [`Parts::Two`], for gradients: a bf16 and what it
+//! is off by, rounded to another, three products; each product is within `2^-16` of the floats' (TF32, which others train with, has `2^-10`).
 //!
 //! The left operand lies in panels of 32 rows, the right one in panels of 32 columns; either is a sequence of steps of 32
 //! of the summed dimension, each step one pair of 1 KiB tiles per part. A row of a left tile is 32 values of one row; a
@@ -22,7 +23,7 @@ mod product;
 mod tests;
 
 pub(crate) use detect::available;
-pub(super) use pack::{column_tiles, row_tiles, transpose, words_of};
+pub(super) use pack::{column_tiles, interleaved, put, row_tiles, transpose, words_of};
 pub(super) use product::{Configured, product, product_onto};
 
 /// Rows of a left panel, columns of a right one.
@@ -39,6 +40,8 @@ pub(super) const TILE_FLOATS: usize = TILE * TILE;
 pub(super) enum Parts {
     /// Rounded to one.
     One,
+    /// Rounded to the sum of two.
+    Two,
     /// Split into three, nothing lost.
     Three,
 }
@@ -47,6 +50,7 @@ impl Parts {
     pub(super) const fn count(self) -> usize {
         match self {
             Self::One => 1,
+            Self::Two => 2,
             Self::Three => 3,
         }
     }

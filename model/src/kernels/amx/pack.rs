@@ -7,8 +7,7 @@ use super::{Parts, STEP, TILE, TILE_FLOATS};
 /// Bits of a float that are its leading bf16.
 const HIGH: i32 = 0xffff_0000_u32 as i32;
 
-/// Sixteen floats as parts, each in the high half of its word: the float itself where there is one part (to be rounded when
-/// it is packed), else leading bits, those after, and the rest.
+/// Sixteen floats as three parts, each in the high half of its word: leading bits, those after, and the rest.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(in crate::kernels) fn split(x: __m512) -> [__m512; 3] {
@@ -20,15 +19,27 @@ pub(in crate::kernels) fn split(x: __m512) -> [__m512; 3] {
     [high, middle, _mm512_sub_ps(rest, middle)]
 }
 
+/// Two times sixteen values rounded to bf16, those of `low` first.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bf16")]
+fn rounded(low: __m512, high: __m512) -> __m512i {
+    // SAFETY: both are 512 bits without a meaning of their own.
+    unsafe { std::mem::transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low)) }
+}
+
 /// Two times sixteen values as one row of each part.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 pub(in crate::kernels) fn words_of(parts: Parts, low: __m512, high: __m512) -> [__m512i; 3] {
     match parts {
-        Parts::One => {
-            // SAFETY: both are 512 bits without a meaning of their own.
-            let rounded = unsafe { std::mem::transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low)) };
-            [rounded; 3]
+        Parts::One => [rounded(low, high); 3],
+        Parts::Two => {
+            let large = rounded(low, high);
+            let float = |half: __m256i| _mm512_castsi512_ps(_mm512_slli_epi32::<16>(_mm512_cvtepu16_epi32(half)));
+            let (of_low, of_high) =
+                (float(_mm512_castsi512_si256(large)), float(_mm512_extracti64x4_epi64::<1>(large)));
+            let rest = rounded(_mm512_sub_ps(low, of_low), _mm512_sub_ps(high, of_high));
+            [large, rest, rest]
         }
         Parts::Three => {
             // The high half of each word, first of `low`, then of `high`.
@@ -59,15 +70,15 @@ fn odd_halves() -> __m512i {
 /// Two rows of the summed dimension as one row of a right tile of each part: words of a value of `first` below one of `second`.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-fn interleaved(parts: Parts, first: __m512, second: __m512) -> [__m512i; 3] {
+pub(in crate::kernels) fn interleaved(parts: Parts, first: __m512, second: __m512) -> [__m512i; 3] {
     let join = |first: __m512i, second: __m512i| {
         let second = _mm512_and_si512(second, _mm512_set1_epi32(HIGH));
         _mm512_or_si512(_mm512_srli_epi32::<16>(first), second)
     };
     match parts {
-        Parts::One => {
+        Parts::One | Parts::Two => {
             // First values in the low half of the result, second ones in the high half; then word by word.
-            let both = words_of(Parts::One, first, second)[0];
+            let both = words_of(parts, first, second);
             const PAIRS: [i16; 32] = {
                 let mut order = [0; 32];
                 let mut i = 0;
@@ -79,13 +90,24 @@ fn interleaved(parts: Parts, first: __m512, second: __m512) -> [__m512i; 3] {
             };
             // SAFETY: as many bits.
             let order = unsafe { std::mem::transmute::<[i16; 32], __m512i>(PAIRS) };
-            [_mm512_permutexvar_epi16(order, both); 3]
+            both.map(|both| _mm512_permutexvar_epi16(order, both))
         }
         Parts::Three => {
             let (a, b) = (split(first), split(second));
             let part = |k: usize| join(_mm512_castps_si512(a[k]), _mm512_castps_si512(b[k]));
             [part(0), part(1), part(2)]
         }
+    }
+}
+
+/// A row of each part to its place in a step of a panel: row `row` of the tile pairs' `half` (0 or 1).
+#[inline]
+#[target_feature(enable = "avx512f")]
+pub(in crate::kernels) fn put(parts: Parts, words: [__m512i; 3], half: usize, row: usize, step: &mut [f32]) {
+    for (part, words) in words.into_iter().take(parts.count()).enumerate() {
+        let to = &mut step[(2 * part + half) * TILE_FLOATS + row * TILE..][..TILE];
+        // SAFETY: 16 words, as just cut.
+        unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), words) };
     }
 }
 
@@ -122,11 +144,7 @@ pub(in crate::kernels) fn row_tiles<'a>(
                 None => (some(rest, TILE), some(&rest[TILE.min(rest.len())..], TILE)),
             };
             let words = words_of(parts, _mm512_mul_ps(low, factor), _mm512_mul_ps(high, factor));
-            for (part, words) in words.into_iter().take(parts.count()).enumerate() {
-                let to = &mut to[(2 * part + half) * TILE_FLOATS + r * TILE..][..TILE];
-                // SAFETY: 16 words, as just cut.
-                unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), words) };
-            }
+            put(parts, words, half, r, to);
         }
     }
 }
@@ -150,12 +168,7 @@ pub(in crate::kernels) fn column_tiles<'a>(
                 false => _mm512_setzero_ps(),
             };
             let p = step * STEP + 2 * pair;
-            let words = interleaved(parts, at(p), at(p + 1));
-            for (part, words) in words.into_iter().take(parts.count()).enumerate() {
-                let to = &mut to[(2 * part + half) * TILE_FLOATS + pair * TILE..][..TILE];
-                // SAFETY: 16 words, as just cut.
-                unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), words) };
-            }
+            put(parts, interleaved(parts, at(p), at(p + 1)), half, pair, to);
         }
     }
 }

@@ -111,6 +111,23 @@ macro_rules! large {
     };
 }
 
+/// `n` steps of two parts, which lie at 0 and 2048 bytes of a step.
+macro_rules! two {
+    () => {
+        concat!(
+            "3:\n",
+            left!("a", 0),
+            right!("b", 2048),
+            multiply!(),
+            right!("b", 0),
+            multiply!(),
+            left!("a", 2048),
+            multiply!(),
+            "add {a}, 4096\n add {b}, 4096\n dec {n}\n jnz 3b\n"
+        )
+    };
+}
+
 /// `m` steps of what is small in products of three parts, which lie at 0, 2048 and 4096 bytes of a step.
 macro_rules! small {
     () => {
@@ -174,6 +191,7 @@ pub(in crate::kernels) unsafe fn product(
 ) {
     match parts {
         Parts::One => tiles!(large!(2048), steps, a, b, c, stride, {}),
+        Parts::Two => tiles!(two!(), steps, a, b, c, stride, {}),
         Parts::Three => tiles!(concat!(small!(), large!(6144)), steps, a, b, c, stride, {
             m = inout(reg) steps => _, e = inout(reg) a => _, f = inout(reg) b => _,
         }),

@@ -10,7 +10,7 @@ use std::cell::RefCell;
 use rayon::prelude::*;
 
 use super::Output;
-use super::pack::{Head, Shape};
+use super::pack::{Head, Shape, logit_scale};
 use crate::kernels::Isa;
 use crate::kernels::aligned::Aligned;
 use crate::kernels::gemm::tile;
@@ -62,6 +62,47 @@ pub struct Source<'a> {
     pub grad: &'a [f32],
     /// The sizes.
     pub shape: Shape,
+}
+
+/// What one head's gradients are taken from.
+pub(super) struct Heads<'a> {
+    pub(super) queries: Head<'a>,
+    pub(super) keys: Head<'a>,
+    pub(super) values: Head<'a>,
+    result: Head<'a>,
+    pub(super) grad: Head<'a>,
+    /// Of each query.
+    pub(super) log_sums: &'a [f32],
+}
+
+impl<'a> Source<'a> {
+    pub(super) fn heads(&self, batch: usize, head: usize) -> Heads<'a> {
+        let Shape { tokens: n, heads, head_dim: d, .. } = self.shape;
+        let width = self.shape.width();
+        let part = |values, part: usize, stride: usize| Head {
+            values,
+            first: batch * n * stride + part * width + head * d,
+            stride,
+            dim: d,
+            tokens: n,
+        };
+        let of_qkv = |index| part(self.qkv, index, 3 * width);
+        Heads {
+            queries: of_qkv(0),
+            keys: of_qkv(1),
+            values: of_qkv(2),
+            result: part(self.result, 0, width),
+            grad: part(self.grad, 0, width),
+            log_sums: &self.log_sums[(batch * heads + head) * n..][..n],
+        }
+    }
+}
+
+impl Heads<'_> {
+    /// `D` of a query.
+    pub(super) fn correction(&self, query: usize) -> f32 {
+        self.grad.row(query).iter().zip(self.result.row(query)).map(|(g, o)| g * o).sum()
+    }
 }
 
 /// One head of one sequence.
@@ -156,26 +197,18 @@ impl Kernel for Task<'_> {
 
     #[inline(always)]
     fn run<S: Simd, const MR: usize>(self) {
-        let Source { qkv, result, log_sums, grad, shape } = self.source;
+        let shape = self.source.shape;
         let (n, d, width, nr) = (shape.tokens, shape.head_dim, shape.width(), 2 * S::W);
         let room = n.next_multiple_of(BLOCK);
         let panels = d.div_ceil(nr);
         let scratch = self.scratch;
-        let log_sums = &log_sums[(self.batch * shape.heads + self.head) * n..][..n];
-        let part = |values, part: usize, stride: usize| Head {
-            values,
-            first: self.batch * n * stride + part * width + self.head * d,
-            stride,
-            dim: d,
-            tokens: n,
-        };
-        let (q, k, v) = (part(qkv, 0, 3 * width), part(qkv, 1, 3 * width), part(qkv, 2, 3 * width));
-        let (g, o) = (part(grad, 0, width), part(result, 0, width));
+        let heads = self.source.heads(self.batch, self.head);
+        let Heads { queries: q, keys: k, values: v, grad: g, log_sums, .. } = &heads;
 
         let scale = 1.0 / (d as f32).sqrt();
         let query_rows = scratch.query_rows.at_least(room * d);
         // The same rounding as in the forward pass, so that the weights fit the kept sums.
-        q.across(MR, std::f32::consts::LOG2_E / (d as f32).sqrt(), query_rows);
+        q.across(MR, logit_scale(d), query_rows);
         let grad_rows = scratch.grad_rows.at_least(room * d);
         g.across(MR, 1.0, grad_rows);
         let key_columns = scratch.key_columns.at_least(room * d);
@@ -190,7 +223,7 @@ impl Kernel for Task<'_> {
         g.along(nr, room, grads);
         let corrections = scratch.corrections.at_least(n);
         for (t, correction) in corrections.iter_mut().enumerate() {
-            *correction = g.row(t).iter().zip(o.row(t)).map(|(g, o)| g * o).sum();
+            *correction = heads.correction(t);
         }
         let weights = scratch.weights.at_least(BLOCK * BLOCK);
         let logit_grads = scratch.logit_grads.at_least(BLOCK * BLOCK);
@@ -268,6 +301,10 @@ pub fn attention_backward(isa: Isa, source: Source<'_>, out: &mut [f32]) {
     assert!(source.grad.len() == rows * shape.width() && source.result.len() == source.grad.len(), "{shape:?}");
     assert_eq!(source.log_sums.len(), rows * shape.heads, "sums of {shape:?}");
     let output = Output { start: out.as_mut_ptr(), len: out.len() };
+    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+    if isa == Isa::Amx {
+        return super::tiles_backward::run(source, output);
+    }
     (0..shape.batch * shape.heads).into_par_iter().with_max_len(1).for_each(|index| {
         let (batch, head) = (index / shape.heads, index % shape.heads);
         // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
@@ -283,6 +320,8 @@ mod tests {
 
     /// Gradients of up to a few units, from sums of a few hundred products.
     const TOLERANCE: f64 = 1e-5;
+    /// Where operands have two parts.
+    const TILES_TOLERANCE: f64 = 3e-5;
 
     /// Obvious f64 version.
     fn reference(qkv: &[f32], grad: &[f32], s: Shape) -> Vec<f64> {
@@ -345,7 +384,8 @@ mod tests {
                 qkv.iter_mut().step_by(7).for_each(|x| *x *= 3.0);
                 let grad = noise(i as u64 + 50, batch * tokens * s.width(), 1.0);
                 let worst = worst_difference(&run(isa, &qkv, &grad, s), &reference(&qkv, &grad, s));
-                assert!(worst < TOLERANCE, "{isa:?} {s:?}: {worst:e}");
+                let tolerance = if isa == Isa::Amx { TILES_TOLERANCE } else { TOLERANCE };
+                assert!(worst < tolerance, "{isa:?} {s:?}: {worst:e}");
             }
         }
     }

@@ -17,6 +17,8 @@ mod pack;
 mod pairs;
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod tiles;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+mod tiles_backward;
 
 use std::cell::RefCell;
 

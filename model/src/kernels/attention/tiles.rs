@@ -2,7 +2,7 @@
 //! from [`crate::kernels::amx`], the softmax between them on vectors in f32. Weights go from the vectors' registers
 //! to the left-hand tiles of the second product; keys and values are packed once per head.
 
-use std::arch::x86_64::{_mm512_mask_mov_ps, _mm512_maskz_mov_ps, _mm512_storeu_si512};
+use std::arch::x86_64::{_mm512_mask_mov_ps, _mm512_maskz_mov_ps};
 use std::cell::RefCell;
 
 use rayon::prelude::*;
@@ -11,8 +11,7 @@ use super::pack::{Inputs, Shape, Sizes, Source, larger, logit_scale, squares};
 use super::{BLOCK_KEYS, FLAT_LOGITS, FLAT_VALUES, Output, PACKED, by_head, each_query_block, whole_blocks};
 use crate::kernels::aligned::Aligned;
 use crate::kernels::amx::{
-    Configured, Parts, SIDE, STEP, TILE, TILE_FLOATS, column_tiles, product, product_onto, row_tiles, transpose,
-    words_of,
+    Configured, Parts, SIDE, STEP, TILE, column_tiles, product, product_onto, put, row_tiles, transpose, words_of,
 };
 use crate::kernels::math::{exp2, exp2_rough, exp2_short};
 use crate::kernels::simd::{Avx512, Simd};
@@ -144,12 +143,7 @@ fn weigh_flat<const ONE: bool>(
         if there < SIDE {
             (low, high) = (first_of(low, there), first_of(high, there.saturating_sub(TILE)));
         }
-        let words = words_of(parts, low, high);
-        for (part, words) in words.into_iter().take(parts.count()).enumerate() {
-            let to = &mut to[(2 * part + r / TILE) * TILE_FLOATS + r % TILE * TILE..][..TILE];
-            // SAFETY: 16 words, as just cut.
-            unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), words) };
-        }
+        put(parts, words_of(parts, low, high), r / TILE, r % TILE, to);
         // SAFETY: one vector.
         unsafe { V::store(total.as_mut_ptr(), V::add(sum, V::add(low, high))) };
     }
@@ -211,12 +205,7 @@ impl Rows<'_> {
                     (low, high) = (first_of(low, there), first_of(high, there.saturating_sub(TILE)));
                 }
                 sum = V::add(sum, V::add(low, high));
-                let words = words_of(self.parts, low, high);
-                for (part, words) in words.into_iter().take(self.parts.count()).enumerate() {
-                    let to = &mut to[(2 * part + half) * TILE_FLOATS + row * TILE..][..TILE];
-                    // SAFETY: 16 words, as just cut.
-                    unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), words) };
-                }
+                put(self.parts, words_of(self.parts, low, high), half, row, to);
             }
             // SAFETY: one vector.
             unsafe { V::store(total.as_mut_ptr(), sum) };
@@ -316,7 +305,7 @@ impl Task<'_> {
                         let there = count - j * SIDE;
                         match parts {
                             Parts::One => weigh_flat::<true>(now, bias, there, left, to, totals),
-                            Parts::Three => weigh_flat::<false>(now, bias, there, left, to, totals),
+                            _ => weigh_flat::<false>(now, bias, there, left, to, totals),
                         }
                     }
                 } else {

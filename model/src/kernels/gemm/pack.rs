@@ -115,7 +115,7 @@ impl PackedWeight {
     }
 
     /// Packs the transpose of row-major `values` `(k, n)`: the layer that goes back through a weight `(k, n)`, or a sum
-    /// over rows. `k > 0`.
+    /// over rows. `k > 0`. Tile units take it in two parts: gradients need no more.
     pub fn transposed(isa: Isa, values: &[f32], n: usize, k: usize) -> Self {
         let mut packed = Self { isa, n, k, data: Aligned::default(), numbers: Numbers::Floats };
         packed.pack_transposed(values, n, k);
@@ -127,7 +127,7 @@ impl PackedWeight {
         assert!(k > 0 && values.len() == n * k, "weight of {k} x {n}");
         #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
         if self.isa == Isa::Amx {
-            return self.pack_tiles_transposed(Parts::Three, values, n, k);
+            return self.pack_tiles_transposed(Parts::Two, values, n, k);
         }
         let nr = self.isa.tile_cols();
         (self.n, self.k) = (n, k);

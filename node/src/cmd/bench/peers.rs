@@ -84,7 +84,14 @@ pub(super) struct Peer {
 /// Every way of running PyTorch: two more runs to those before. A way that fails (compiling wants a C++ compiler) says so.
 pub(super) fn time_peers(python: &Path, peers: &mut Vec<Peer>) -> Result<()> {
     if peers.is_empty() {
-        let new = |name| Peer { name, seconds: Vec::new(), median_s: None, times_less: None, said: json!(null), failed: None };
+        let new = |name| Peer {
+            name,
+            seconds: Vec::new(),
+            median_s: None,
+            times_less: None,
+            said: json!(null),
+            failed: None,
+        };
         peers.extend(PEERS.map(|(name, _)| new(name)));
     }
     let script = "tests/python/peer_network.py";
