@@ -3,15 +3,20 @@
 mod table;
 
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
+use tracing::info;
 
 use super::{Outcome, UsageError, progress_bar};
 use crate::config::{Config, ModelConfigSection};
 use crate::engine::evaluate::bag::{BagClips, Part};
 use crate::engine::evaluate::{Clip, Effort, Evaluation, HELD_OUT_SEEDS, Method};
 use crate::engine::{Engine, ModelSource, UNTRAINED};
+
+/// A clip that took longer is told of in the log, for those who see no bar.
+const LONG: Duration = Duration::from_secs(20);
 
 /// Arguments of `storm eval`.
 #[derive(Debug, clap::Args)]
@@ -109,8 +114,9 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let mut evaluation = Evaluation::new(engine, per_frame.transpose()?, &args.methods, effort);
 
     let bar = progress_bar(progress, (data.count() * args.methods.len()) as u64, "scoring");
+    let mut clips = 0;
     data.each(size, |clip| {
-        let mut at = None;
+        let (mut at, begin) = (None, Instant::now());
         let result = evaluation.add(&clip, &mut |method, steps| {
             if at != Some(method) {
                 bar.inc(u64::from(at.is_some()));
@@ -120,6 +126,11 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
             bar.set_message(format!("{}: {}{steps}", clip.name, method.name()));
         });
         bar.inc(1);
+        clips += 1;
+        let took = begin.elapsed();
+        if took > LONG && bar.is_hidden() {
+            info!("{}: {clips} of {} clips, {:.0} s", clip.name, data.count(), took.as_secs_f64());
+        }
         result
     })?;
     bar.finish_and_clear();
