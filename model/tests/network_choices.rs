@@ -1,6 +1,8 @@
 //! The network under every choice, window shape and bad input, on a small untrained network.
 #![allow(clippy::unwrap_used)]
 
+use std::sync::Arc;
+
 use candle_core::{DType, Device, Tensor, Var};
 use glam::{Affine3A, Quat, Vec3};
 use storm_model::config::{
@@ -100,6 +102,32 @@ fn every_choice_runs_and_renders() {
         assert!(scene.render(&mut rasterizer, &[(view, Some(2))], 0.25, want).is_err(), "camera 2 of 2");
         assert!(scene.render(&mut rasterizer, &targets, f32::NAN, want).is_err());
     }
+}
+
+#[test]
+fn what_was_seen_nearer_in_time_counts_for_more() {
+    let storm = Storm::untrained(&small(), 5, &Device::Cpu).unwrap();
+    let mut scene = storm.forward(&clip(2, 2, 8, 12)).unwrap().scene(0).unwrap();
+    let plain = scene.gaussians.opacities.clone();
+    let of_first = plain.len() / 2;
+    let time_sec = scene.gaussians.time_sec[0];
+    assert!(scene.gaussians.time_sec[of_first] != time_sec, "two timesteps");
+    Arc::make_mut(&mut scene.config).time_fade_sec = 0.0;
+    assert_eq!(*scene.opacities_at(time_sec), plain);
+    Arc::make_mut(&mut scene.config).time_fade_sec = 0.25;
+    let faded = scene.opacities_at(time_sec).into_owned();
+    let denser = |i: usize| f64::from(-faded[i]).ln_1p() / f64::from(-plain[i]).ln_1p();
+    for i in 0..of_first {
+        assert!(denser(i) > 1.0 && denser(of_first + i) < 1.0, "{} {}", denser(i), denser(of_first + i));
+        let mean = 0.5 * (denser(i) + denser(of_first + i));
+        assert!((mean - 1.0).abs() < 1e-3, "optical depth is kept on the mean: {mean}");
+    }
+    for fade in [1e-30, 1e30] {
+        Arc::make_mut(&mut scene.config).time_fade_sec = fade;
+        assert!(scene.opacities_at(time_sec + 100.0).iter().all(|a| (0.0..=1.0).contains(a)), "{fade}");
+    }
+    scene.gaussians.opacities.fill(1.0);
+    assert!(scene.opacities_at(time_sec).iter().all(|a| *a == 1.0), "what is opaque stays so");
 }
 
 #[test]

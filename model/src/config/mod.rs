@@ -91,6 +91,9 @@ pub struct ModelConfig {
     pub affine: AffineKind,
     /// Velocities slower than this are drawn as zero in rendered flow, m/s; 0 draws all.
     pub flow_gate_mps: f64,
+    /// How fast Gaussians give way, away from their own time, to those nearer to the time that is drawn, seconds: their optical
+    /// depths are weighted by `exp(-|time - own time| / this)`, relative to the mean over the window's pictures; 0: all alike, as in the paper.
+    pub time_fade_sec: f64,
     /// Which gsplat rules rendering follows.
     pub gsplat: GsplatConvention,
 }

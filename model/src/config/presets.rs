@@ -41,6 +41,7 @@ impl Default for ModelConfig {
             sky: SkyKind::Raw512,
             affine: AffineKind::Gain,
             flow_gate_mps: 1.0,
+            time_fade_sec: 0.0,
             gsplat: GsplatConvention::Pinned,
         }
     }
@@ -117,6 +118,7 @@ impl ModelConfig {
             sky: SkyKind::Frequency64,
             affine: AffineKind::MatrixBias,
             flow_gate_mps: 1.0,
+            time_fade_sec: 0.2,
             velocity_scale: 10.0,
             velocity_bases: VelocityBases::Spread,
             ..Self::default()
@@ -142,6 +144,7 @@ impl ModelConfig {
             sky: SkyKind::Frequency64,
             affine: AffineKind::MatrixBias,
             flow_gate_mps: 0.0,
+            time_fade_sec: 0.0,
             ..self
         }
     }

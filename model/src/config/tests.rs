@@ -36,7 +36,7 @@ fn unknown_names_and_fields_are_refused() {
 #[test]
 fn every_bad_value_is_named() {
     type Spoil = fn(&mut ModelConfig);
-    let cases: [(&str, Spoil); 12] = [
+    let cases: [(&str, Spoil); 13] = [
         ("patch_size", |c| c.patch_size = 12),
         ("num_heads", |c| c.num_heads = 7),
         ("image_width", |c| c.image_width = 100),
@@ -48,6 +48,7 @@ fn every_bad_value_is_named() {
         ("far", |c| c.far = c.near),
         ("max_scale", |c| c.max_scale = f64::INFINITY),
         ("flow_gate_mps", |c| c.flow_gate_mps = -1.0),
+        ("time_fade_sec", |c| c.time_fade_sec = f64::NAN),
         ("embed_dim", |c| c.embed_dim = usize::MAX),
     ];
     for (field, spoil) in cases {

@@ -85,6 +85,7 @@ impl ModelConfig {
         number("scale_offset", self.scale_offset, true, "use a finite number")?;
         number("max_scale", self.max_scale, self.max_scale > 0.0, "use a positive number of metres")?;
         number("opacity_offset", self.opacity_offset, true, "use a finite number")?;
-        number("flow_gate_mps", self.flow_gate_mps, self.flow_gate_mps >= 0.0, "use 0 (off) or more, m/s")
+        number("flow_gate_mps", self.flow_gate_mps, self.flow_gate_mps >= 0.0, "use 0 (off) or more, m/s")?;
+        number("time_fade_sec", self.time_fade_sec, self.time_fade_sec >= 0.0, "use 0 (off) or more, seconds")
     }
 }

@@ -1,5 +1,7 @@
 //! A scene to pictures (paper sections 3.1 and 3.2): move, splat, put the sky behind, apply the camera's exposure.
 
+use std::borrow::Cow;
+
 use rayon::prelude::*;
 use storm_render::View;
 use storm_render::raster::{Convention, CpuRasterizer, Picture, RasterSettings, Splats};
@@ -92,7 +94,7 @@ impl Scene {
             means: &means,
             quats: &self.gaussians.quats,
             scales: &self.gaussians.scales,
-            opacities: &self.gaussians.opacities,
+            opacities: &self.opacities_at(time_sec),
             features: &features,
             feature_count,
         };
@@ -108,6 +110,32 @@ impl Scene {
     /// Centres at a time, in order (paper eq. 1).
     pub fn means_at(&self, time_sec: f32) -> Vec<[f32; 3]> {
         (0..self.gaussians.len()).into_par_iter().map(|i| self.gaussians.mean_at(i, time_sec)).collect()
+    }
+
+    /// Opacities for drawing at a time, in order: those of Gaussians nearer to it count for more (`time_fade_sec`).
+    ///
+    /// What a window says of one place in different timesteps disagrees (movers most of all), and what was seen nearest to the
+    /// time is least wrong about it. Weights multiply optical depths and their mean is 1, so that surfaces stay as dense.
+    pub fn opacities_at(&self, time_sec: f32) -> Cow<'_, [f32]> {
+        let opacities = &self.gaussians.opacities;
+        let pixels = self.shape.height * self.shape.width;
+        let pictures = self.shape.timesteps * self.shape.cameras;
+        if self.config.time_fade_sec <= 0.0 || pictures < 2 || pixels * pictures != opacities.len() {
+            return Cow::Borrowed(opacities);
+        }
+        let fade = self.config.time_fade_sec as f32;
+        let apart = |own: &[f32]| own.first().map_or(0.0, |own| (time_sec - own).abs());
+        let apart: Vec<f32> = self.gaussians.time_sec.chunks_exact(pixels).map(apart).collect();
+        // Relative to the nearest, so that not all can vanish.
+        let least = apart.iter().copied().fold(f32::INFINITY, f32::min);
+        let weights: Vec<f32> = apart.iter().map(|apart| ((least - apart) / fade).exp()).collect();
+        let mean = weights.iter().sum::<f32>() / pictures as f32;
+        let mut faded = opacities.clone();
+        faded.par_chunks_mut(pixels).zip(&weights).for_each(|(picture, weight)| {
+            let weight = weight / mean;
+            picture.iter_mut().filter(|a| **a < 1.0).for_each(|a| *a = -(weight * (-*a).ln_1p()).exp_m1());
+        });
+        Cow::Owned(faded)
     }
 
     fn exposure(&self, camera: Option<usize>) -> Result<Affine, ModelError> {

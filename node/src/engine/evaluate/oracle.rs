@@ -78,7 +78,7 @@ pub(super) fn scene(clip: &Clip, config: &Arc<ModelConfig>, motion: Motion) -> O
         width: camera.width,
     };
     // The true flow needs no gate against noise.
-    let config = Arc::new(ModelConfig { flow_gate_mps: 0.0, ..ModelConfig::clone(config) });
+    let config = Arc::new(ModelConfig { flow_gate_mps: 0.0, time_fade_sec: 0.0, ..ModelConfig::clone(config) });
     let motion_bases = Vec::new();
     (g.len() == shape.len()).then_some(Scene {
         gaussians: g,
