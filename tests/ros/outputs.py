@@ -7,6 +7,10 @@ import numpy as np
 from drive import CAMERAS, CLOUD, Drive, IMAGE, INFO, OK, RELIABLE_INPUT, TOLERANCE, close, expect, newest, running
 from peer import LATCHED, RELIABLE, Peer, StormNode, points, read_bag, stamp_of, until
 
+OBJECTS = "/storm/output/objects"
+# Of about 25.
+FEWEST_STEPS = 20
+
 
 def same_as_replay(program, bag, work):
     """Every output message of the live node is the replay's: types, frames, stamps, values.
@@ -31,7 +35,7 @@ def same_as_replay(program, bag, work):
         with StormNode(program, RELIABLE_INPUT | {"overlap.enabled": "false"}) as node:
             topics = {"/storm/output/gaussians": CLOUD, "/storm/output/flow": CLOUD, "/storm/output/map": CLOUD,
                       "/storm/output/map_update": CLOUD, "/storm/output/tracks": CLOUD,
-                      "/storm/output/objects": "visualization_msgs/msg/MarkerArray",
+                      OBJECTS: "visualization_msgs/msg/MarkerArray",
                       "/storm/output/detections": "vision_msgs/msg/Detection3DArray",
                       "/storm/output/trajectory": "nav_msgs/msg/Path", "/tf": "tf2_msgs/msg/TFMessage"}
             for i in range(CAMERAS):
@@ -63,6 +67,7 @@ def same_as_replay(program, bag, work):
             every = [t for t in topics if (t, steps[-2]) in replayed]
             until(lambda: all(peer.count(t) >= len(steps) - 2 for t in every), 20,
                   lambda: f"{len(steps)} steps on {dict((t, peer.count(t)) for t in every)}")
+            until(lambda: peer.count(OBJECTS) > FEWEST_STEPS, 20, lambda: f"{peer.count(OBJECTS)} object messages")
             time.sleep(1.5)
             status = newest(peer)
             expect(node.interrupt() == 0, f"exit code:\n{node.log()}")
@@ -120,8 +125,8 @@ def moving(peer):
     expect(clouds[0].header.frame_id == "storm_origin" and len(rows) > 0, "no trajectories")
     expect({"vx", "age", "track_id"} <= set(rows.dtype.names), f"{rows.dtype.names}")
     expect(len(set(rows["track_id"])) == len(rows) and rows["age"].max() > 0, "trajectories are not told apart")
-    arrays = peer.messages("/storm/output/objects", "visualization_msgs/msg/MarkerArray")
-    expect(len(arrays) > 20, f"{len(arrays)} object messages")
+    arrays = peer.messages(OBJECTS, "visualization_msgs/msg/MarkerArray")
+    expect(len(arrays) > FEWEST_STEPS, f"{len(arrays)} object messages")
     detections = peer.messages("/storm/output/detections", "vision_msgs/msg/Detection3DArray")
     boxes = [m for a in arrays for m in a.markers if m.type == 1]
     found = [d for a in detections for d in a.detections]
