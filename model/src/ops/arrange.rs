@@ -49,6 +49,12 @@ pub(crate) fn unnest(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<
         })?;
         return Tensor::from_vec(out, result, x.device());
     }
+    // candle goes through no more than 8 axes that do not lie one in the other: more levels are taken one by one.
+    if levels > 3 {
+        let ((rows, cols), inner) = (grid, 1 << (2 * (levels - 1)));
+        let x = x.reshape((pictures, rows, cols, 2, 2, inner * c))?.permute((0, 1, 3, 2, 4, 5))?.contiguous()?;
+        return unnest(&x.reshape((all, c))?, (2 * rows, 2 * cols), levels - 1);
+    }
     let mut shape = vec![pictures, grid.0, grid.1];
     shape.extend(std::iter::repeat_n(2, 2 * levels));
     shape.push(c);

@@ -262,6 +262,19 @@ fn any_layout_and_shared_inputs() {
 }
 
 #[test]
+fn pictures_of_any_number_of_levels_are_put_in_order_and_have_a_gradient() {
+    for levels in 1..=5 {
+        let x = noise(levels as u64, &[2 * 3 * 2 << (2 * levels), 2], 1.0);
+        let var = Var::from_tensor(&x).unwrap();
+        let ordered = unnest(var.as_tensor(), (3, 2), levels).unwrap();
+        assert_eq!(flat(&ordered), flat(&unnest(&x, (3, 2), levels).unwrap()), "{levels} levels: as the kernel");
+        let grads = ordered.sqr().unwrap().sum_all().unwrap().backward().unwrap();
+        let twice: Vec<f64> = flat(&x).iter().map(|x| 2.0 * x).collect();
+        assert_eq!(gradient(&grads, &var), twice, "{levels} levels");
+    }
+}
+
+#[test]
 fn only_what_is_tracked_gets_a_gradient() {
     let (x, w1, b1, w2) = (noise(1, &[9, 6], 1.0), noise(2, &[8, 6], 1.0), noise(3, &[8], 1.0), noise(4, &[5, 8], 1.0));
     let var = |t: &Tensor| Var::from_tensor(t).unwrap().as_tensor().clone();
