@@ -264,7 +264,7 @@ fn any_layout_and_shared_inputs() {
 #[test]
 fn pictures_of_any_number_of_levels_are_put_in_order_and_have_a_gradient() {
     for levels in 1..=5 {
-        let x = noise(levels as u64, &[2 * 3 * 2 << (2 * levels), 2], 1.0);
+        let x = noise(levels as u64, &[(2 * 3 * 2) << (2 * levels), 2], 1.0);
         let var = Var::from_tensor(&x).unwrap();
         let ordered = unnest(var.as_tensor(), (3, 2), levels).unwrap();
         assert_eq!(flat(&ordered), flat(&unnest(&x, (3, 2), levels).unwrap()), "{levels} levels: as the kernel");
