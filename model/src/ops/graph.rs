@@ -325,7 +325,7 @@ mod tests {
     fn gradients_of_nodes_and_of_others_are_added_and_dropped_results_leave_nothing() {
         let x = Var::new(&[1f32, -3.0], &Device::Cpu).unwrap();
         let y = twice(x.as_tensor());
-        // Two nodes and two of candle's own operations read `y`: 2 (2 + 2 (2 + 2) + 1) = 22.
+        // Two nodes and one of candle's own operations read `y`: 2 (2 + 2 (2 + 2) + 1) = 22.
         let z = twice(&y);
         let sum = ((twice(&(&z + &z).unwrap()) + twice(&y)).unwrap() + &y).unwrap();
         for _ in 0..2 {

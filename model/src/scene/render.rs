@@ -123,7 +123,8 @@ impl Scene {
         if self.config.time_fade_sec <= 0.0 || pictures < 2 || pixels * pictures != opacities.len() {
             return Cow::Borrowed(opacities);
         }
-        let fade = self.config.time_fade_sec as f32;
+        // Not 0 where it was too small for f32: that would make the nearest NaN.
+        let fade = (self.config.time_fade_sec as f32).max(f32::MIN_POSITIVE);
         let apart = |own: &[f32]| own.first().map_or(0.0, |own| (time_sec - own).abs());
         let apart: Vec<f32> = self.gaussians.time_sec.chunks_exact(pixels).map(apart).collect();
         // Relative to the nearest, so that not all can vanish.

@@ -6,10 +6,8 @@
 
 use std::cell::RefCell;
 
-use rayon::prelude::*;
-
 use super::Output;
-use super::backward::{Heads, Source};
+use super::backward::{Heads, Source, Task, each_head};
 use super::pack::{Head, logit_scale};
 use crate::kernels::aligned::Aligned;
 use crate::kernels::amx::{
@@ -137,18 +135,9 @@ fn turn(products: &[f32], there: usize, log_sums: &[f32], corrections: &[f32], t
     }
 }
 
-/// One head of one sequence.
-struct Task<'a> {
-    source: Source<'a>,
-    batch: usize,
-    head: usize,
-    scratch: &'a mut Scratch,
-    out: Output,
-}
-
-impl Task<'_> {
+impl Task<'_, Scratch> {
     #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx512vnni,avx2,fma")]
-    fn run(self) {
+    fn run_tiles(self) {
         let shape = self.source.shape;
         let (n, d, width) = (shape.tokens, shape.head_dim, shape.width());
         let heads = self.source.heads(self.batch, self.head);
@@ -279,13 +268,8 @@ impl Task<'_> {
 
 /// See [`super::attention_backward`].
 pub(super) fn run(source: Source<'_>, out: Output) {
-    let shape = source.shape;
-    (0..shape.batch * shape.heads).into_par_iter().with_max_len(1).for_each(|index| {
-        let (batch, head) = (index / shape.heads, index % shape.heads);
-        // No rayon call happens inside, so a thread cannot come back here while it holds its scratch.
-        SCRATCH.with_borrow_mut(|scratch| {
-            // SAFETY: `Isa::Amx`, under which alone this runs, exists only where the features were detected.
-            unsafe { Task { source, batch, head, scratch, out }.run() };
-        });
+    each_head(source, out, &SCRATCH, |task: Task<'_, Scratch>| {
+        // SAFETY: `Isa::Amx`, under which alone this runs, exists only where the features were detected.
+        unsafe { task.run_tiles() };
     });
 }
