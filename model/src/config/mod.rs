@@ -94,6 +94,9 @@ pub struct ModelConfig {
     /// How fast Gaussians give way, away from their own time, to those nearer to the time that is drawn, seconds: their optical
     /// depths are weighted by `exp(-|time - own time| / this)`, relative to the mean over the window's pictures; 0: all alike, as in the paper.
     pub time_fade_sec: f64,
+    /// Variance that rasterising adds to both axes of every splat, square pixels: gsplat's 0.3 for the authors' sizes. A smaller
+    /// one draws sharper, by networks that were trained to be drawn so.
+    pub screen_blur_px2: f64,
     /// Which gsplat rules rendering follows.
     pub gsplat: GsplatConvention,
 }

@@ -42,6 +42,7 @@ impl Default for ModelConfig {
             affine: AffineKind::Gain,
             flow_gate_mps: 1.0,
             time_fade_sec: 0.0,
+            screen_blur_px2: 0.3,
             gsplat: GsplatConvention::Pinned,
         }
     }
@@ -119,6 +120,7 @@ impl ModelConfig {
             affine: AffineKind::MatrixBias,
             flow_gate_mps: 1.0,
             time_fade_sec: 0.2,
+            screen_blur_px2: 0.1,
             velocity_scale: 10.0,
             velocity_bases: VelocityBases::Spread,
             ..Self::default()
@@ -145,6 +147,7 @@ impl ModelConfig {
             affine: AffineKind::MatrixBias,
             flow_gate_mps: 0.0,
             time_fade_sec: 0.0,
+            screen_blur_px2: 0.3,
             ..self
         }
     }

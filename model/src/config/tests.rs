@@ -36,7 +36,7 @@ fn unknown_names_and_fields_are_refused() {
 #[test]
 fn every_bad_value_is_named() {
     type Spoil = fn(&mut ModelConfig);
-    let cases: [(&str, Spoil); 13] = [
+    let cases: [(&str, Spoil); 15] = [
         ("patch_size", |c| c.patch_size = 12),
         ("num_heads", |c| c.num_heads = 7),
         ("image_width", |c| c.image_width = 100),
@@ -49,6 +49,8 @@ fn every_bad_value_is_named() {
         ("max_scale", |c| c.max_scale = f64::INFINITY),
         ("flow_gate_mps", |c| c.flow_gate_mps = -1.0),
         ("time_fade_sec", |c| c.time_fade_sec = f64::NAN),
+        ("screen_blur_px2", |c| c.screen_blur_px2 = -0.1),
+        ("screen_blur_px2", |c| c.screen_blur_px2 = f64::NAN),
         ("embed_dim", |c| c.embed_dim = usize::MAX),
     ];
     for (field, spoil) in cases {

@@ -15,6 +15,9 @@ const MAX_SIDE: usize = 4096;
 /// Largest layer width; four times the largest published model, and small enough that no product of two overflows.
 const MAX_WIDTH: usize = 8192;
 
+/// Most variance added to a splat, square pixels: past two pixels of standard deviation nothing sharp is left.
+const MAX_BLUR_PX2: f64 = 4.0;
+
 fn in_range(field: &'static str, value: usize, low: usize, high: usize) -> Result<(), ModelError> {
     if (low..=high).contains(&value) {
         return Ok(());
@@ -86,6 +89,8 @@ impl ModelConfig {
         number("max_scale", self.max_scale, self.max_scale > 0.0, "use a positive number of metres")?;
         number("opacity_offset", self.opacity_offset, true, "use a finite number")?;
         number("flow_gate_mps", self.flow_gate_mps, self.flow_gate_mps >= 0.0, "use 0 (off) or more, m/s")?;
-        number("time_fade_sec", self.time_fade_sec, self.time_fade_sec >= 0.0, "use 0 (off) or more, seconds")
+        number("time_fade_sec", self.time_fade_sec, self.time_fade_sec >= 0.0, "use 0 (off) or more, seconds")?;
+        let blur = self.screen_blur_px2;
+        number("screen_blur_px2", blur, (0.0..=MAX_BLUR_PX2).contains(&blur), "use 0 to 4 square pixels")
     }
 }

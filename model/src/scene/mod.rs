@@ -7,6 +7,7 @@ mod sky;
 use std::sync::Arc;
 
 pub use affine::Affine;
+pub(crate) use render::fade_weights;
 pub use render::{RenderedView, Want};
 pub use sky::SkyModel;
 use storm_render::Gaussians;

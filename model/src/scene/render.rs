@@ -50,7 +50,13 @@ impl ModelConfig {
             GsplatConvention::Pinned => Convention::Pinned,
             GsplatConvention::Latest => Convention::Latest,
         };
-        RasterSettings { convention, near: self.near as f32, far: self.far as f32, ..RasterSettings::default() }
+        RasterSettings {
+            convention,
+            near: self.near as f32,
+            far: self.far as f32,
+            blur: self.screen_blur_px2 as f32,
+            ..RasterSettings::default()
+        }
     }
 }
 
@@ -120,20 +126,15 @@ impl Scene {
         let opacities = &self.gaussians.opacities;
         let pixels = self.shape.height * self.shape.width;
         let pictures = self.shape.timesteps * self.shape.cameras;
-        if self.config.time_fade_sec <= 0.0 || pictures < 2 || pixels * pictures != opacities.len() {
+        if pixels * pictures != opacities.len() {
             return Cow::Borrowed(opacities);
         }
-        // Not 0 where it was too small for f32: that would make the nearest NaN.
-        let fade = (self.config.time_fade_sec as f32).max(f32::MIN_POSITIVE);
-        let apart = |own: &[f32]| own.first().map_or(0.0, |own| (time_sec - own).abs());
-        let apart: Vec<f32> = self.gaussians.time_sec.chunks_exact(pixels).map(apart).collect();
-        // Relative to the nearest, so that not all can vanish.
-        let least = apart.iter().copied().fold(f32::INFINITY, f32::min);
-        let weights: Vec<f32> = apart.iter().map(|apart| ((least - apart) / fade).exp()).collect();
-        let mean = weights.iter().sum::<f32>() / pictures as f32;
+        let own: Vec<f32> = self.gaussians.time_sec.iter().step_by(pixels.max(1)).copied().collect();
+        let Some(weights) = fade_weights(&own, time_sec, self.config.time_fade_sec) else {
+            return Cow::Borrowed(opacities);
+        };
         let mut faded = opacities.clone();
         faded.par_chunks_mut(pixels).zip(&weights).for_each(|(picture, weight)| {
-            let weight = weight / mean;
             picture.iter_mut().filter(|a| **a < 1.0).for_each(|a| *a = -(weight * (-*a).ln_1p()).exp_m1());
         });
         Cow::Owned(faded)
@@ -196,6 +197,22 @@ impl Scene {
             want.motion.then(|| (0..width * height).map(|i| first_largest(&pixel(i)[motion_at..])).collect());
         RenderedView { width, height, color, alpha, depth, flow, motion_id }
     }
+}
+
+/// What the optical depths of images taken at `own_sec` are multiplied by when `time_sec` is drawn; their mean is 1. None where all
+/// count alike: no fade, or fewer than two images.
+pub(crate) fn fade_weights(own_sec: &[f32], time_sec: f32, fade_sec: f64) -> Option<Vec<f32>> {
+    if fade_sec <= 0.0 || own_sec.len() < 2 {
+        return None;
+    }
+    // Not 0 where it was too small for f32: that would make the nearest NaN.
+    let fade = (fade_sec as f32).max(f32::MIN_POSITIVE);
+    let apart: Vec<f32> = own_sec.iter().map(|own| (time_sec - own).abs()).collect();
+    // Relative to the nearest, so that not all can vanish.
+    let least = apart.iter().copied().fold(f32::INFINITY, f32::min);
+    let weights: Vec<f32> = apart.iter().map(|apart| ((least - apart) / fade).exp()).collect();
+    let mean = weights.iter().sum::<f32>() / weights.len() as f32;
+    Some(weights.into_iter().map(|weight| weight / mean).collect())
 }
 
 fn sky_color(sky: &SkyModel, camera: &RayCamera, row: usize, col: usize) -> [f32; 3] {

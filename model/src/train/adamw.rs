@@ -22,11 +22,13 @@ pub struct AdamOptions {
     pub weight_decay: f64,
     /// Gradients longer than this (all tensors together) are scaled down to it; 0 never.
     pub clip_norm: f64,
+    /// Learning rate of the velocity bases' decoder over that of all else: how far bases get from where they start.
+    pub basis_rate: f64,
 }
 
 impl Default for AdamOptions {
     fn default() -> Self {
-        Self { beta1: 0.9, beta2: 0.95, eps: 1e-8, weight_decay: 0.05, clip_norm: 3.0 }
+        Self { beta1: 0.9, beta2: 0.95, eps: 1e-8, weight_decay: 0.05, clip_norm: 3.0, basis_rate: 1.0 }
     }
 }
 
@@ -70,6 +72,11 @@ fn decays(name: &str, shape: &[usize]) -> bool {
     shape.len() >= 2 && !name.ends_with("_token") && !name.ends_with("_tokens") && name != "pos_embed"
 }
 
+/// What the learning rate of a tensor is multiplied by.
+fn rate_factor(name: &str, options: &AdamOptions) -> f64 {
+    if name.starts_with("motion_basis_decoder") { options.basis_rate } else { 1.0 }
+}
+
 /// Length of all gradients together; a missing gradient is zero.
 pub fn global_norm(gradients: &[Option<Vec<f32>>]) -> f64 {
     let square = |g: &Option<Vec<f32>>| g.iter().flatten().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>();
@@ -94,11 +101,13 @@ pub fn step(
     let power = i32::try_from(step + 1).unwrap_or(i32::MAX);
     let (fix1, fix2) = (1.0 - options.beta1.powi(power), 1.0 - options.beta2.powi(power));
     let (b1, b2) = (options.beta1 as f32, options.beta2 as f32);
-    let (rate, root, eps) = ((learning_rate / fix1) as f32, (1.0 / fix2.sqrt()) as f32, options.eps as f32);
+    let (root, eps) = ((1.0 / fix2.sqrt()) as f32, options.eps as f32);
     // An average over the first steps would mostly remember the untrained network.
     let keep = average_decay.min((1.0 + step as f64) / (10.0 + step as f64)) as f32;
     let clip = clip as f32;
     slots.par_iter_mut().zip(gradients).try_for_each(|(slot, gradient)| {
+        let learning_rate = learning_rate * rate_factor(&slot.name, options);
+        let rate = (learning_rate / fix1) as f32;
         let shrink = if slot.decays { (1.0 - learning_rate * options.weight_decay) as f32 } else { 1.0 };
         let Slot { name, shape, weight, first, second, average, .. } = slot;
         let clipped = |i: usize| gradient.as_ref().map_or(0.0, |g| g[i] * clip);
@@ -153,6 +162,16 @@ mod tests {
         for (a, b) in slots[0].weight.iter().zip(want) {
             assert!((a - b).abs() <= ROUNDING, "{a} for {b}");
         }
+    }
+
+    #[test]
+    fn only_the_bases_decoder_has_its_own_rate() {
+        let options = AdamOptions { basis_rate: 10.0, weight_decay: 0.0, ..AdamOptions::default() };
+        let names = ["motion_basis_decoder.fc2.bias", "motion_query_heads.0.fc1.bias"];
+        let mut slots = names.map(|name| Slot::new(name, &[1], vec![0.0]));
+        let gradients = [Some(vec![1.0]), Some(vec![1.0])];
+        step(&mut slots, &gradients, 0, 1e-3, 0.9, muon::Optimizer::AdamW, &options).unwrap();
+        assert!((slots[0].weight[0] + 1e-2).abs() < 1e-6 && (slots[1].weight[0] + 1e-3).abs() < 1e-7);
     }
 
     #[test]

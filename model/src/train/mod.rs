@@ -1,6 +1,7 @@
 //! Training: data from procedural drives, losses, optimiser, checkpoints, validation.
 
 mod adamw;
+mod bases;
 mod checkpoint;
 #[cfg(test)]
 mod clip_tests;

@@ -118,6 +118,7 @@ impl TrainOptions {
         let a = &self.adam;
         rule(unit.contains(&a.beta1), "beta1", a.beta1, "0 to below 1")?;
         rule(unit.contains(&a.beta2), "beta2", a.beta2, "0 to below 1")?;
+        rule(a.basis_rate > 0.0 && a.basis_rate <= 100.0, "basis_rate", a.basis_rate, "more than 0, at most 100")?;
         rule(a.eps > 0.0, "eps", a.eps, "more than 0")?;
         let p = &self.pixel;
         let weights = [
@@ -130,6 +131,7 @@ impl TrainOptions {
             ("velocity", p.velocity),
             ("flow", p.flow),
             ("groups", p.groups),
+            ("bases", p.bases),
             ("render depth", self.render.depth),
             ("sky_opacity", self.render.sky_opacity),
             ("render velocity", self.render.velocity),

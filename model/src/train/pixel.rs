@@ -3,6 +3,7 @@
 use candle_core::{D, Tensor};
 use serde::{Deserialize, Serialize};
 
+use super::bases::bases_loss;
 use super::clips::TrainClip;
 use super::groups::group_loss;
 use super::losses::{Terms, channel_last, color_loss, depth_loss, masked_mean, velocity_loss};
@@ -37,6 +38,8 @@ pub struct PixelLossOptions {
     pub flow: f64,
     /// Cross-entropy of the motion weights against the tokens whose velocity is the true one; left out with `flow`.
     pub groups: f64,
+    /// Mean absolute difference, m/s, between the scene's motions and the velocity bases nearest to them; left out with `flow`.
+    pub bases: f64,
     /// How much more a moving pixel weighs than a standing one in the flow terms.
     pub moving_weight: f64,
 }
@@ -54,6 +57,7 @@ impl Default for PixelLossOptions {
             velocity: 0.005,
             flow: 0.1,
             groups: 0.05,
+            bases: 0.0,
             moving_weight: 10.0,
         }
     }
@@ -105,7 +109,7 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
     }
     if options.flow > 0.0 {
         let labelled = (&surface * &truth.flow_known)?;
-        let weights = (labelled * truth.moving.affine(options.moving_weight - 1.0, 1.0)?)?;
+        let weights = (&labelled * truth.moving.affine(options.moving_weight - 1.0, 1.0)?)?;
         let share = options.flow / velocities.len() as f64;
         let mut sum: Option<Tensor> = None;
         for v in velocities {
@@ -116,6 +120,9 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
             };
         }
         add("flow", share, sum)?;
+        if options.bases > 0.0 {
+            add("bases", options.bases, bases_loss(output, &truth.flow, &(&labelled * &truth.moving)?)?)?;
+        }
         if options.groups > 0.0 {
             add("groups", options.groups, group_loss(output, &truth.flow, &weights)?)?;
         }

@@ -15,6 +15,7 @@ use crate::config::{DepthMeaning, ModelConfig, VelocityKind};
 use crate::error::ModelError;
 use crate::network::ClipOutput;
 use crate::rays::Rays;
+use crate::scene::fade_weights;
 
 /// All terms of a batch whose clips have target pictures. With `features`, they take the structure term's place, with its
 /// weight and from its step on.
@@ -70,20 +71,19 @@ pub fn draw_targets(
         return Err(ModelError::Input(text));
     }
     let n = steps * cameras * rows * cols;
-    let still = Tensor::cat(
-        &[&output.quats, &output.scales, &output.opacities.unsqueeze(D::Minus1)?, &output.colors],
-        D::Minus1,
-    )?;
     let times = target.time_sec.to_device(&candle_core::Device::Cpu)?.flatten_all()?.to_vec1::<f32>()?;
     let views = views(target)?;
     let mut drawn = Vec::with_capacity(b * t);
     for window in 0..b {
-        let still = still.get(window)?.reshape((n, ()))?;
+        let shape =
+            Tensor::cat(&[&output.quats.get(window)?, &output.scales.get(window)?], D::Minus1)?.reshape((n, ()))?;
+        let colors = output.colors.get(window)?.reshape((n, 3))?;
         for k in 0..t {
             let first = (window * t + k) * v;
             let means = means_at(output, window, f64::from(times[first]))?.reshape((n, 3))?;
             let seen: Vec<View> = views[first..first + v].to_vec();
-            drawn.push(draw(&Tensor::cat(&[&means, &still], 1)?, seen, renderer)?);
+            let opacities = opacities_at(output, window, times[first])?.reshape((n, 1))?;
+            drawn.push(draw(&Tensor::cat(&[&means, &shape, &opacities, &colors], 1)?, seen, renderer)?);
         }
     }
     let drawn = Tensor::stack(&drawn, 0)?.reshape(vec![b, t, v, h, w, DRAWN])?;
@@ -92,6 +92,21 @@ pub fn draw_targets(
     let colors = drawn.narrow(D::Minus1, 0, 3)?.contiguous()?;
     let image = finish(output, colors, &alpha, target)?;
     Ok(Rendered { image, depth: channel(4)?.contiguous()?, alpha })
+}
+
+/// Opacities above this fade as this: the derivative of what they become is infinite at 1.
+const FADING_OPACITY_MAX: f64 = 1.0 - 1e-4;
+
+/// Opacities of one window for drawing at a time, `(t, v, h, w)`: as [`crate::Scene::opacities_at`].
+fn opacities_at(output: &ClipOutput, window: usize, time_sec: f32) -> Result<Tensor, ModelError> {
+    let opacities = output.opacities.get(window)?;
+    let own = output.time_sec.get(window)?;
+    let (t, v) = own.dims2()?;
+    let own = own.to_device(&candle_core::Device::Cpu)?.flatten_all()?.to_vec1::<f32>()?;
+    let Some(weights) = fade_weights(&own, time_sec, output.config.time_fade_sec) else { return Ok(opacities) };
+    let weights = Tensor::from_vec(weights, (t, v, 1, 1), opacities.device())?;
+    let depth = opacities.minimum(FADING_OPACITY_MAX)?.affine(-1.0, 1.0)?.log()?;
+    Ok(depth.broadcast_mul(&weights)?.exp()?.affine(-1.0, 1.0)?)
 }
 
 /// Centres of one window at a time (paper eq. 1), `(t, v, h, w, 3)`.

@@ -60,9 +60,7 @@ fn targets_are_drawn_as_a_scene_draws_them() {
         let output = storm.forward(&clip.context).unwrap();
         let (target, _) = clip.target.as_ref().unwrap();
         let drawn = draw_targets(&output, target, &renderer(&config)).unwrap();
-        let mut scene = output.scene(0).unwrap();
-        // Training draws as the paper does.
-        Arc::make_mut(&mut scene.config).time_fade_sec = 0.0;
+        let scene = output.scene(0).unwrap();
         let mut raster = CpuRasterizer::new(scene.raster_settings()).unwrap();
         let (views, times) = (views(target).unwrap(), values(&target.time_sec));
         for k in 0..2 {

@@ -84,6 +84,9 @@ pub struct Args {
     /// scale, color, depth and log_depth to the drawn pictures: they know better what several timesteps together look like.
     #[arg(long, value_name = "TERM=WEIGHT", conflicts_with = "resume")]
     pixel_weight: Vec<String>,
+    /// Learning rate of the velocity bases' decoder over that of all else [default: 1]; with `--pixel-weight bases=0.1` 10.
+    #[arg(long, allow_hyphen_values = true, conflicts_with = "resume")]
+    basis_rate: Option<f64>,
     /// Weight of the velocity regulariser [default: 0.005, the paper's].
     #[arg(long, allow_hyphen_values = true)]
     lambda_reg: Option<f64>,
@@ -246,6 +249,9 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
     if let Some(x) = args.lambda_reg {
         options.pixel.velocity = x;
         options.render.velocity = x;
+    }
+    if let Some(x) = args.basis_rate {
+        options.adam.basis_rate = x;
     }
     options.pixel = variants::set_keys("--pixel-weight", &options.pixel, &args.pixel_weight)?;
     args.variant.apply(&mut options);
