@@ -104,6 +104,7 @@ fn clip(stored: &Stored) -> Result<ClipBatch, Box<dyn Error>> {
         world_from_camera: stored["context_camtoworlds"].clone(),
         time_sec: (&stored["context_time"] * 2.0)?,
         timespan_sec: 2.0,
+        prior: None,
     })
 }
 

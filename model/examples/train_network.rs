@@ -39,6 +39,7 @@ fn clip(config: &ModelConfig, batch: usize, cameras: usize) -> Result<ClipBatch,
         world_from_camera: repeat(&one.world_from_camera)?,
         time_sec: repeat(&one.time_sec)?,
         timespan_sec: one.timespan_sec,
+        prior: None,
     })
 }
 

@@ -23,6 +23,8 @@ pub struct ClipBatch {
     pub time_sec: Tensor,
     /// Seconds that count as 1 in the time embedding (2.0 in the paper).
     pub timespan_sec: f64,
+    /// An image shortly before each of `image`, of the same shape, for a velocity sweep; they are never tokens. None: there are none.
+    pub prior: Option<Box<ClipBatch>>,
 }
 
 /// Order of the numbers in a picture.
@@ -92,6 +94,7 @@ impl ClipBatch {
             world_from_camera: Tensor::from_vec(poses, (1, t, v, 4, 4), device)?,
             time_sec: Tensor::from_vec(times, (1, t, v), device)?,
             timespan_sec,
+            prior: None,
         })
     }
 
@@ -103,7 +106,12 @@ impl ClipBatch {
             world_from_camera: self.world_from_camera.to_dtype(dtype)?,
             time_sec: self.time_sec.to_dtype(dtype)?,
             timespan_sec: self.timespan_sec,
+            prior: self.map_prior(|prior| prior.to_dtype(dtype))?,
         })
+    }
+
+    fn map_prior(&self, to: impl Fn(&Self) -> Result<Self, ModelError>) -> Result<Option<Box<Self>>, ModelError> {
+        self.prior.as_ref().map(|prior| to(prior).map(Box::new)).transpose()
     }
 
     /// Several windows of the same shape and timespan as one batch.
@@ -120,6 +128,11 @@ impl ClipBatch {
             world_from_camera: cat(|c| &c.world_from_camera)?,
             time_sec: cat(|c| &c.time_sec)?,
             timespan_sec: first.timespan_sec,
+            prior: match clips.iter().map(|c| c.prior.as_deref().cloned()).collect::<Option<Vec<_>>>() {
+                Some(priors) => Some(Box::new(Self::stack(&priors)?)),
+                // Windows with and without them are alike only without.
+                None => None,
+            },
         })
     }
 
@@ -131,6 +144,7 @@ impl ClipBatch {
             world_from_camera: self.world_from_camera.narrow(0, index, 1)?,
             time_sec: self.time_sec.narrow(0, index, 1)?,
             timespan_sec: self.timespan_sec,
+            prior: self.map_prior(|prior| prior.window(index))?,
         })
     }
 
@@ -142,6 +156,7 @@ impl ClipBatch {
             world_from_camera: self.world_from_camera.narrow(1, t, 1)?,
             time_sec: self.time_sec.narrow(1, t, 1)?,
             timespan_sec: self.timespan_sec,
+            prior: self.map_prior(|prior| prior.timestep(t))?,
         })
     }
 
@@ -162,6 +177,14 @@ impl ClipBatch {
         for (name, tensor, shape) in expected {
             if tensor.dims() != shape {
                 return Err(ModelError::Input(format!("{name} has shape {:?}, expected {shape:?}", tensor.dims())));
+            }
+        }
+        if let Some(prior) = &self.prior {
+            let shape = prior.dims()?;
+            if shape != [b, t, v, h, w] {
+                let text =
+                    format!("prior images have shape {shape:?} (b, t, v, h, w), the window {:?}", [b, t, v, h, w]);
+                return Err(ModelError::Input(text));
             }
         }
         Ok([b, t, v, h, w])

@@ -62,6 +62,9 @@ pub struct ModelConfig {
     /// Hidden width of the velocity basis MLP.
     pub basis_hidden: usize,
 
+    /// Blocks before a sweep over velocities gives matching evidence to the tokens; 0: none, as in the paper. Less than `depth`.
+    pub sweep_after_block: usize,
+
     /// Nearest depth, metres; also the rasteriser's near plane.
     pub near: f64,
     /// Farthest depth, metres; also the rasteriser's far plane.

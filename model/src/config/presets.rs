@@ -27,6 +27,7 @@ impl Default for ModelConfig {
             upsampler_widths: vec![512, 256, 128],
             key_hidden: 256,
             basis_hidden: 256,
+            sweep_after_block: 0,
             near: 0.2,
             far: 400.0,
             depth_meaning: DepthMeaning::ZDepth,

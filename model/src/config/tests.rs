@@ -36,10 +36,11 @@ fn unknown_names_and_fields_are_refused() {
 #[test]
 fn every_bad_value_is_named() {
     type Spoil = fn(&mut ModelConfig);
-    let cases: [(&str, Spoil); 15] = [
+    let cases: [(&str, Spoil); 16] = [
         ("patch_size", |c| c.patch_size = 12),
         ("num_heads", |c| c.num_heads = 7),
         ("image_width", |c| c.image_width = 100),
+        ("sweep_after_block", |c| c.sweep_after_block = c.depth),
         ("num_cams", |c| c.num_cams = 7),
         ("depth", |c| c.depth = 0),
         ("upsampler_widths", |c| c.upsampler_widths = vec![8]),

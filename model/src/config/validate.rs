@@ -18,6 +18,9 @@ const MAX_WIDTH: usize = 8192;
 /// Most variance added to a splat, square pixels: past two pixels of standard deviation nothing sharp is left.
 const MAX_BLUR_PX2: f64 = 4.0;
 
+/// A sweep divides a patch into four cells a side.
+const LEAST_SWEPT_PATCH: usize = 4;
+
 fn in_range(field: &'static str, value: usize, low: usize, high: usize) -> Result<(), ModelError> {
     if (low..=high).contains(&value) {
         return Ok(());
@@ -62,6 +65,15 @@ impl ModelConfig {
                 let fix = format!("use a multiple of patch_size {}", self.patch_size);
                 return Err(ModelError::Config { field, value: side.to_string(), fix });
             }
+        }
+        if self.sweep_after_block >= self.depth {
+            let value = self.sweep_after_block.to_string();
+            let fix = format!("use 0 (no sweep) to {}: at least one block must follow", self.depth - 1);
+            return Err(ModelError::Config { field: "sweep_after_block", value, fix });
+        }
+        if self.sweep_after_block > 0 && self.patch_size < LEAST_SWEPT_PATCH {
+            let fix = format!("use {LEAST_SWEPT_PATCH} or more with sweep_after_block, or sweep_after_block 0");
+            return Err(ModelError::Config { field: "patch_size", value: self.patch_size.to_string(), fix });
         }
         in_range("num_cams", self.num_cams, 1, MAX_CAMERAS)?;
         in_range("num_motion_tokens", self.num_motion_tokens, 0, 256)?;

@@ -10,6 +10,7 @@ mod reuse;
 mod shortcuts;
 mod sky;
 mod stages;
+pub(crate) mod sweep;
 mod tokens;
 mod transformer;
 mod upsample;
@@ -42,6 +43,7 @@ pub struct Storm {
     affine_token: Option<Tensor>,
     motion_tokens: Option<Tensor>,
     transformer: transformer::Transformer,
+    sweep: Option<sweep::SweepHead>,
     gaussians: gaussians::GaussianHead,
     motion: motion::MotionHead,
     sky: Option<Arc<sky::SkyHead>>,
@@ -69,6 +71,7 @@ impl Storm {
             affine_token: token(config.use_affine_token, "affine_token")?,
             motion_tokens: token(config.num_motion_tokens > 0, "motion_tokens")?,
             transformer: transformer::Transformer::new(&config, &params)?,
+            sweep: (config.sweep_after_block > 0).then(|| sweep::SweepHead::new(&params)).transpose()?,
             gaussians: gaussians::GaussianHead::new(&params)?,
             motion: motion::MotionHead::new(&config, &params)?,
             sky: sky.map(Arc::new),
@@ -153,10 +156,18 @@ impl Storm {
         };
         let extra = tokens.dim(1)? - grid.patches();
         let plan = TokenPlan::new(shortcuts, grid, extra, activity.as_deref());
-        let tokens = self.transformer.forward(tokens, &plan, shortcuts.precision, stages)?;
+        let mut swept = None;
+        let tokens = self.transformer.forward(tokens, &plan, shortcuts.precision, stages, &mut |blocks, x| {
+            let Some(head) = self.sweep.as_ref().filter(|_| blocks == config.sweep_after_block) else { return Ok(x) };
+            let evidence = head.forward(config, batch, 0, &plan.patches(&x, extra)?)?;
+            let x = plan.add(x, &evidence.added, extra)?;
+            swept = Some(evidence.depths);
+            Ok(x)
+        })?;
 
         let newest = (shortcuts.newest_only && timesteps > 1).then_some(timesteps - 1);
         let mut output = self.decode(batch, rays, &tokens, newest, stages)?;
+        output.swept_depths = swept;
         if let Some(keep) = &shortcuts.keep {
             output.hide(keep, grid)?;
         }
@@ -208,6 +219,7 @@ impl Storm {
             velocity_forward: motion.velocity_forward,
             motion_weights: motion.weights,
             motion_bases: motion.bases,
+            swept_depths: None,
             affine,
             sky_token,
             time_sec,

@@ -36,6 +36,8 @@ pub struct ClipOutput {
     pub motion_weights: Option<Tensor>,
     /// `(b, M, 3 | 6)` velocity bases as the network states them; none without motion tokens.
     pub motion_bases: Option<Tensor>,
+    /// `(b, t, v, rows, cols)` of cells (a quarter of a patch): depths a velocity sweep was made at, metres as `depths`; none without.
+    pub swept_depths: Option<Tensor>,
     /// `(b, v, 3, 4)` exposure matrices, see [`crate::config::AffineKind`].
     pub affine: Option<Tensor>,
     /// `(b, 1, embed_dim)`; colours the sky through [`ClipOutput::sky_color`].

@@ -92,7 +92,15 @@ impl Storm {
         let tokens = self.with_extra_tokens(image, v)?;
         let extra = tokens.dim(1)? - patches;
         let taken = Taken { extra, older: older.as_ref().map(|older| &older.keys_values[..]) };
-        let (tokens, keys_values) = self.transformer.forward_taking(tokens, &taken, precision)?;
+        let first = whole.dims()?[1] - new.dims()?[1];
+        let between = &mut |blocks: usize, x: Tensor| -> Result<Tensor, ModelError> {
+            let config = &*self.config;
+            let Some(head) = self.sweep.as_ref().filter(|_| blocks == config.sweep_after_block) else { return Ok(x) };
+            let images = x.narrow(1, extra, patches)?.contiguous()?;
+            let images = (&images + head.forward(config, whole, first, &images)?.added)?;
+            Ok(Tensor::cat(&[&x.narrow(1, 0, extra)?, &images], 1)?)
+        };
+        let (tokens, keys_values) = self.transformer.forward_taking(tokens, &taken, precision, between)?;
         let output = self.decode(new, rays, &tokens, None, stages)?;
         let output = match older {
             Some(older) => output.after(&older.output)?,

@@ -96,6 +96,8 @@ pub(crate) struct TokenPlan {
     pub pooled: Option<Groups>,
     /// Of the tokens then, the queries of the last block; none: all.
     pub last_queries: Option<Vec<u32>>,
+    /// The row of each patch among the tokens in the blocks; none: it is not computed.
+    group_of_patch: Vec<Option<u32>>,
     /// Where each token of the output comes from: a row of the last block's result; none: was not computed.
     back: Vec<Option<Return>>,
 }
@@ -168,9 +170,11 @@ impl TokenPlan {
         };
         let mut own_of_patch = vec![None; patches];
         computed.iter().enumerate().for_each(|(i, &patch)| own_of_patch[patch] = Some(extra + i));
+        let group = |own: usize| merged.as_ref().map_or(own as u32, |groups| groups.of[own]);
+        let group_of_patch = own_of_patch.iter().map(|own| own.map(group)).collect();
         let of_patches = (0..patches).filter(|&p| of_output(p)).map(|p| own_of_patch[p].and_then(returning));
         let back = (0..extra).map(returning).chain(of_patches).collect();
-        Self { kept, merged, pooled, last_queries, back }
+        Self { kept, merged, pooled, last_queries, group_of_patch, back }
     }
 
     /// Patches each token stands for, where that is not one for all.
@@ -188,6 +192,25 @@ impl TokenPlan {
             Some(groups) => Entered { tokens: groups.mean(&tokens)?, before_merging: Some(tokens) },
             None => Entered { tokens, before_merging: None },
         })
+    }
+
+    /// The patches' rows of the tokens `x` in the blocks, `(b, patches, d)`: a merged token's for all it stands for, zeros for what
+    /// is not computed.
+    pub fn patches(&self, x: &Tensor, extra: usize) -> Result<Tensor> {
+        if self.kept.is_none() && self.merged.is_none() {
+            return x.narrow(1, extra, x.dim(1)? - extra)?.contiguous();
+        }
+        let (b, rows, d) = x.dims3()?;
+        let x = Tensor::cat(&[x, &Tensor::zeros((b, 1, d), x.dtype(), x.device())?], 1)?;
+        let of: Vec<u32> = self.group_of_patch.iter().map(|row| row.unwrap_or(rows as u32)).collect();
+        select(&x, &of)
+    }
+
+    /// `x` with `(b, patches, d)` added to the patches' tokens; merged ones get the mean.
+    pub fn add(&self, x: Tensor, patches: &Tensor, extra: usize) -> Result<Tensor> {
+        let (b, _, d) = x.dims3()?;
+        let none = Tensor::zeros((b, extra, d), x.dtype(), x.device())?;
+        x + self.enter(Tensor::cat(&[&none, patches], 1)?)?.tokens
     }
 
     /// The last block's result as tokens of the output, `(b, tokens, d)`: a merged token gives what the blocks made of it to

@@ -49,13 +49,14 @@ impl Transformer {
         Ok(Self { blocks, norm: params.norm("norm")?, heads: config.num_heads })
     }
 
-    /// `(b, n, d)` to `(b, n, d)`, products in `precision`; as many tokens as the plan puts out.
+    /// `(b, n, d)` to `(b, n, d)`, products in `precision`, `between` the blocks; as many tokens as the plan puts out.
     pub fn forward(
         &self,
         tokens: Tensor,
         plan: &TokenPlan,
         precision: Precision,
         stages: &mut Stages,
+        between: &mut Between<'_>,
     ) -> Result<Tensor, ModelError> {
         let entered = plan.enter(tokens)?;
         let mut x = entered.tokens.clone();
@@ -77,6 +78,7 @@ impl Transformer {
                 Ok(())
             })?;
             stages.keep(&format!("block_{k}"), &x);
+            x = between(k + 1, x)?;
         }
         let x = self.norm.forward(&plan.finish(x, &entered)?)?;
         stages.keep("tokens_norm", &x);
@@ -89,6 +91,7 @@ impl Transformer {
         tokens: Tensor,
         taken: &Taken<'_>,
         precision: Precision,
+        between: &mut Between<'_>,
     ) -> Result<(Tensor, Vec<Tensor>), ModelError> {
         let (mut x, mut kept) = (tokens, Vec::with_capacity(self.blocks.len()));
         for (k, block) in self.blocks.iter().enumerate() {
@@ -98,7 +101,7 @@ impl Transformer {
             let (out, keys_values) =
                 block.forward_taking(&x, taken.extra, older.transpose()?, self.heads, precision)?;
             kept.push(keys_values);
-            x = out;
+            x = between(k + 1, out)?;
         }
         Ok((self.norm.forward(&x)?, kept))
     }
@@ -111,6 +114,9 @@ pub(crate) struct Taken<'a> {
     /// Keys and values of older patches, one `(b, n, 2 d)` per block; none: all tokens are new.
     pub older: Option<&'a [Tensor]>,
 }
+
+/// What happens to the tokens after so many blocks.
+pub(crate) type Between<'a> = dyn FnMut(usize, Tensor) -> Result<Tensor, ModelError> + 'a;
 
 /// Takes what is only computed when it is kept.
 type Probe<'a> = dyn FnMut(&str, &dyn Fn() -> candle_core::Result<Tensor>) -> candle_core::Result<()> + 'a;

@@ -49,6 +49,10 @@ pub struct ClipOptions {
     /// Strides the anchor may lie before the first timestep, where the clock then begins too: windows that go on in the frame
     /// of an earlier one (`Storm::forward_reusing`) look so. 0: at the first timestep, the paper's.
     pub anchor_lead: u32,
+    /// How long before each timestep a prior image is taken for a velocity sweep, seconds; 0: none.
+    pub prior_sec: f64,
+    /// Share of the blocks of training batches that have no prior images all the same, so that the network does without.
+    pub prior_dropout: f64,
 }
 
 /// Share of the clips whose anchor is at the first timestep all the same.
@@ -74,6 +78,8 @@ impl Default for ClipOptions {
             traffic: [0.75, 2.5],
             variety: false,
             anchor_lead: 0,
+            prior_sec: 0.0,
+            prior_dropout: 0.2,
         }
     }
 }
@@ -93,6 +99,9 @@ impl ClipOptions {
         rule((1..=10).contains(&self.timesteps), "timesteps", self.timesteps as f64, "1 to 10")?;
         rule(self.targets <= 10, "targets", self.targets as f64, "0 to 10")?;
         let needed = self.length_sec();
+        rule((0.0..1.0).contains(&self.prior_sec), "prior_sec", self.prior_sec, "0 (none) to below 1")?;
+        let share = self.prior_dropout;
+        rule((0.0..=1.0).contains(&share), "prior_dropout", share, "0 to 1")?;
         rule(self.drive_sec >= needed, "drive_sec", self.drive_sec, "at least the clip's length")?;
         let [low, high] = self.traffic;
         rule(low >= 0.0 && high >= low, "traffic", low, "a range from 0 to 3")
@@ -129,6 +138,8 @@ pub struct ClipPlan {
     pub traffic: f64,
     /// Factors on the focal lengths.
     pub zoom: [f32; 2],
+    /// How long before each timestep a prior image is taken, seconds; 0: none.
+    pub prior_sec: f64,
     /// How long before `start_sec` the anchor was where it is, and the clock began, seconds.
     pub lead_sec: f64,
 }
@@ -165,7 +176,10 @@ impl ClipPlan {
         let mut target_sec: Vec<f64> =
             (0..options.targets).map(|_| rng.random_range(0..frames) as f64 / RATE_HZ).collect();
         target_sec.sort_by(f64::total_cmp);
-        Self { drive_seed, start_sec, target_sec, traffic, zoom: [1.0; 2], lead_sec: 0.0 }
+        // There is nothing before the drive.
+        let start_sec = f64::max(start_sec, options.prior_sec);
+        let prior_sec = options.prior_sec;
+        Self { drive_seed, start_sec, target_sec, traffic, zoom: [1.0; 2], prior_sec, lead_sec: 0.0 }
     }
 
     /// Drives it. `config` says what the network's depth measures and where its rays pass.
@@ -193,7 +207,11 @@ impl ClipPlan {
             let clip = Shot::clip(shots, options.span_sec)?;
             Ok((clip, Truth::of(shots, &anchor_from_map.matrix3, config)?))
         };
-        let (clip, context_truth) = batch(&context)?;
+        let (mut clip, context_truth) = batch(&context)?;
+        if self.prior_sec > 0.0 {
+            let times: Vec<f64> = context_sec.iter().map(|t| t - self.prior_sec).collect();
+            clip.prior = Some(Box::new(Shot::clip(&shots(&times), options.span_sec)?));
+        }
         Ok(TrainClip {
             context: clip,
             context_truth,
@@ -296,13 +314,17 @@ impl TrainClip {
     }
 }
 
-fn map_clip(clip: &ClipBatch, to: impl Fn(&Tensor) -> candle_core::Result<Tensor>) -> candle_core::Result<ClipBatch> {
+fn map_clip(clip: &ClipBatch, to: &impl Fn(&Tensor) -> candle_core::Result<Tensor>) -> candle_core::Result<ClipBatch> {
     Ok(ClipBatch {
         image: to(&clip.image)?,
         intrinsics: to(&clip.intrinsics)?,
         world_from_camera: to(&clip.world_from_camera)?,
         time_sec: to(&clip.time_sec)?,
         timespan_sec: clip.timespan_sec,
+        prior: match &clip.prior {
+            Some(prior) => Some(Box::new(map_clip(prior, to)?)),
+            None => None,
+        },
     })
 }
 

@@ -71,6 +71,14 @@ impl DataOptions {
         }
     }
 
+    /// How long before its timesteps batch `index` has prior images, seconds; 0: it has none.
+    fn prior_sec(&self, index: u64) -> f64 {
+        let block = index / (BLOCK * self.reuse.max(1));
+        // Apart from the choice of cameras, which has the same seed.
+        let draw: f64 = ChaCha8Rng::seed_from_u64(self.seed ^ !block.rotate_left(32)).random();
+        if draw < self.clips.prior_dropout { 0.0 } else { self.clips.prior_sec }
+    }
+
     /// The number of target times of batch `index`.
     pub(super) fn targets(&self, index: u64) -> usize {
         if index < self.targets_from { 0 } else { self.clips.targets }
@@ -84,7 +92,7 @@ impl DataOptions {
     fn batch_with(&self, index: u64, config: &ModelConfig, kept: &Kept) -> Result<TrainClip, TrainError> {
         let cameras = self.cameras(index);
         let targets = self.targets(index);
-        let clips = ClipOptions { cameras, targets, ..self.clips };
+        let clips = ClipOptions { cameras, targets, prior_sec: self.prior_sec(index), ..self.clips };
         let samples = self.samples(index);
         let lock = || kept.lock().unwrap_or_else(PoisonError::into_inner);
         let block = BLOCK * self.reuse.max(1);

@@ -124,6 +124,7 @@ impl TrainOptions {
         let weights = [
             ("log_depth", p.log_depth),
             ("depth", p.depth),
+            ("swept_depth", p.swept_depth),
             ("color", p.color),
             ("opacity", p.opacity),
             ("scale", p.scale),

@@ -20,6 +20,8 @@ const EPS: f64 = 1e-4;
 pub struct PixelLossOptions {
     /// Mean absolute error of the logarithm of depth.
     pub log_depth: f64,
+    /// Mean absolute error of the logarithm of the depths that a velocity sweep is made at; nothing without a sweep.
+    pub swept_depth: f64,
     /// The paper's depth term.
     pub depth: f64,
     /// Mean squared colour error after the exposure.
@@ -48,6 +50,7 @@ impl Default for PixelLossOptions {
     fn default() -> Self {
         Self {
             log_depth: 1.0,
+            swept_depth: 0.2,
             depth: 1.0,
             color: 1.0,
             opacity: 0.1,
@@ -80,6 +83,13 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
         let known = (&truth.distance + measured.affine(-1.0, 1.0)?)?;
         let error = (output.depths.log()? - known.log()?)?.abs()?;
         add("log_depth", options.log_depth, masked_mean(&error, &measured)?)?;
+    }
+    if options.swept_depth > 0.0
+        && let Some(swept) = &output.swept_depths
+    {
+        let (known, share) = log_depth_of_cells(&truth.distance, &measured, swept.dims())?;
+        let error = (swept.log()? - known)?.abs()?;
+        add("swept_depth", options.swept_depth, masked_mean(&error, &share)?)?;
     }
     if options.depth > 0.0 {
         add("pixel_depth", options.depth, depth_loss(&output.depths, &truth.distance)?)?;
@@ -149,6 +159,21 @@ pub(super) fn exposed(output: &ClipOutput, colors: &Tensor) -> Result<Tensor, Mo
     let by_camera = colors.transpose(1, 2)?.contiguous()?.reshape((b, v, t * h * w, 3))?;
     let exposed = output.apply_affine(&by_camera)?.reshape((b, v, t, h, w, 3))?;
     Ok(exposed.transpose(1, 2)?.contiguous()?)
+}
+
+/// Means of the logarithm of known distances over cells, and the share of a cell's pixels that are known, both of shape `cells`.
+fn log_depth_of_cells(distance: &Tensor, known: &Tensor, cells: &[usize]) -> Result<(Tensor, Tensor), ModelError> {
+    let (&[b, t, v, h, w], &[_, _, _, rows, cols]) = (distance.dims(), cells) else {
+        return Err(ModelError::Input(format!("depths of shape {:?} for cells {cells:?}", distance.dims())));
+    };
+    let mean = |x: Tensor| -> candle_core::Result<Tensor> {
+        let x = x.reshape(vec![b * t * v * rows, h / rows, cols, w / cols])?;
+        x.mean(3)?.mean(1)?.reshape(cells)
+    };
+    let share = mean(known.clone())?;
+    let logs = (distance + known.affine(-1.0, 1.0)?)?.log()?;
+    let sum = mean((logs * known)?)?;
+    Ok(((sum / share.maximum(EPS)?)?, share))
 }
 
 /// `(b, t, v, h, w)`: `footprint_px` pixels at the true z-depth, metres, at most `max_scale`; 1 where it is unknown.

@@ -52,8 +52,9 @@ fn values(config: &ModelConfig, spec: &TensorSpec, seed: u64) -> Vec<f32> {
             let spread = |i: usize| if (i / width).is_multiple_of(channels) { depth_spread } else { START_SPREAD };
             (0..count).map(|i| (spread(i) * unit * cut_normal(&mut rng)) as f32).collect()
         }
+        Init::MiddleDepth => vec![middle_depth(config) as f32; count],
         Init::GaussianHeadBias => {
-            let depth = 0.5 * (raw_depth(config, START_DEPTHS_M[0]) + raw_depth(config, START_DEPTHS_M[1]));
+            let depth = middle_depth(config);
             let opacity = logit(START_OPACITY) - config.opacity_offset;
             let row = |channel| match channel {
                 0 => depth,
@@ -65,6 +66,10 @@ fn values(config: &ModelConfig, spec: &TensorSpec, seed: u64) -> Vec<f32> {
         }
         Init::IdentityAffine => (0..count).map(|i| if i % 5 == 0 { 1.0 } else { 0.0 }).collect(),
     }
+}
+
+fn middle_depth(config: &ModelConfig) -> f64 {
+    0.5 * (raw_depth(config, START_DEPTHS_M[0]) + raw_depth(config, START_DEPTHS_M[1]))
 }
 
 /// The raw depth channel that gives `depth_m`, as far as the near and far planes allow it.

@@ -1,6 +1,7 @@
 //! Every tensor of a network: its name in the authors' checkpoints, its shape, and how an untrained one starts.
 
 use crate::config::{MaskDecoder, ModelConfig, SkyKind};
+use crate::network::sweep;
 
 /// Channels of the frequency-encoded time (128 cosines, 128 sines).
 pub(crate) const TIME_CHANNELS: usize = 256;
@@ -23,6 +24,8 @@ pub enum Init {
     GaussianHead,
     /// Offsets of the Gaussian head: depths about 5-40 m, half-open opacity, unit quaternion.
     GaussianHeadBias,
+    /// The middle of the depths that an untrained network shows.
+    MiddleDepth,
     /// The exposure that changes nothing.
     IdentityAffine,
 }
@@ -114,6 +117,12 @@ fn transformer(specs: &mut Specs, config: &ModelConfig) {
         specs.linear(&format!("{block}.mlp.fc2"), config.mlp_ratio * d, d);
     }
     specs.norm("norm", d);
+    if config.sweep_after_block > 0 {
+        specs.norm("sweep.norm", d);
+        specs.add("sweep.depth.weight", &[sweep::CELLS * sweep::CELLS, d], Init::Normal(STD));
+        specs.add("sweep.depth.bias", &[sweep::CELLS * sweep::CELLS], Init::MiddleDepth);
+        specs.add("sweep.inject.weight", &[d, sweep::EVIDENCE], Init::Zeros);
+    }
 }
 
 /// Inputs and hidden width of the sky head's first layer.

@@ -40,6 +40,7 @@ pub fn clip(inputs: &Goldens) -> ClipBatch {
         world_from_camera: inputs["context_camtoworlds"].clone(),
         time_sec: (&inputs["context_time"] * f64::from(timespan)).unwrap(),
         timespan_sec: f64::from(timespan),
+        prior: None,
     }
 }
 

@@ -90,6 +90,10 @@ pub struct Args {
     /// Weight of the velocity regulariser [default: 0.005, the paper's].
     #[arg(long, allow_hyphen_values = true)]
     lambda_reg: Option<f64>,
+    /// Give each timestep an image so many seconds before it for the velocity sweep (networks with sweep_after_block), but for a
+    /// fifth of the clips [default: 0, none].
+    #[arg(long, default_value_t = 0.0, conflicts_with = "resume")]
+    prior_sec: f64,
     /// Cameras of a clip, 1 to 6.
     #[arg(long, default_value_t = 3)]
     cameras: usize,
@@ -225,6 +229,7 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         cameras: args.cameras,
         width: config.image_width,
         height: config.image_height,
+        prior_sec: args.prior_sec,
         ..ClipOptions::default()
     };
     let from = match (args.recorded.alone(), args.weights.is_empty()) {
