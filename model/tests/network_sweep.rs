@@ -22,8 +22,7 @@ fn config() -> ModelConfig {
 }
 
 fn clip(config: &ModelConfig, prior_sec: f64) -> TrainClip {
-    let options =
-        ClipOptions { width: 24, height: 16, timesteps: 3, targets: 0, prior_sec, ..ClipOptions::default() };
+    let options = ClipOptions { width: 24, height: 16, timesteps: 3, targets: 0, prior_sec, ..ClipOptions::default() };
     ClipPlan::training(3, 1, &options).make(&options, config).unwrap()
 }
 

@@ -97,6 +97,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     }
     let source = ModelSource::open(&config.model)?;
     let size = source.picture_size(&config.model)?;
+    config.model.sweep_prior_sec = source.prior_sec(&config.model);
     let data = Data::open(args, &config, size)?;
     let cameras = data.cameras();
     let timespan_sec = config.window.timespan_sec;
@@ -115,7 +116,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
 
     let bar = progress_bar(progress, (data.count() * args.methods.len()) as u64, "scoring");
     let mut clips = 0;
-    data.each(size, |clip| {
+    data.each(size, config.model.sweep_prior_sec, |clip| {
         let (mut at, begin) = (None, Instant::now());
         let result = evaluation.add(&clip, &mut |method, steps| {
             if at != Some(method) {
@@ -195,7 +196,7 @@ impl Data {
             );
             return Err(UsageError(text).into());
         }
-        let clips = Box::new(BagClips::open(path, config, size, &part)?);
+        let clips = Box::new(BagClips::open(path, config, size, config.model.sweep_prior_sec, &part)?);
         let name = path.file_name().map_or_else(|| "bag".into(), |n| n.to_string_lossy().into_owned());
         Ok(Self::Bag { clips, name, part })
     }
@@ -214,11 +215,11 @@ impl Data {
         }
     }
 
-    fn each(&self, size: (usize, usize), mut each: impl FnMut(Clip) -> Result<()>) -> Result<()> {
+    fn each(&self, size: (usize, usize), prior_sec: f64, mut each: impl FnMut(Clip) -> Result<()>) -> Result<()> {
         match self {
             Self::Drives(seeds) => {
                 for seed in seeds.clone() {
-                    each(Clip::of_seed(seed, size).with_context(|| format!("seed {seed}"))?)?;
+                    each(Clip::of_seed(seed, size, prior_sec).with_context(|| format!("seed {seed}"))?)?;
                 }
                 Ok(())
             }

@@ -97,6 +97,8 @@ section! {
         image_height: usize = 0,
         /// Threads for the network and the rasteriser; 0: all cores.
         threads: usize = 0,
+        /// How long before each timestep the network's velocity sweep has one more image, seconds (networks with `sweep_after_block`); 0: none. Where images come too seldom there is none.
+        sweep_prior_sec: f64 = 0.1,
         /// Numbers of the transformer's products: `f32`, `int16` (whole numbers with exact sums), `int8` (the same, weights in 8 bits), `bf16` (operands rounded to bf16: fastest where the processor has AMX tile units, elsewhere no faster than `f32`). On a CPU; elsewhere as they are.
         precision: String = "f32".into(),
     }

@@ -101,6 +101,7 @@ impl Config {
         one_of("live.reliability", &self.live.reliability, &["sensor_data", "reliable"])?;
         one_of("input.rectified", &self.input.rectified, &["auto", "yes", "no"])?;
         one_of("model.precision", &self.model.precision, &Precision::ALL.map(|(_, name)| name))?;
+        between("model.sweep_prior_sec", self.model.sweep_prior_sec, 0.0, 1.0)?;
         one_of("model.device", &self.model.device, &["cpu", "cuda", "metal"])?;
         for x in &self.input.image_time_offset_sec {
             between("input.image_time_offset_sec", *x, -60.0, 60.0)?;

@@ -11,6 +11,7 @@ mod tests;
 pub mod truth;
 
 use std::path::Path;
+use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use candle_core::Device;
@@ -26,6 +27,7 @@ use tracing::warn;
 use crate::config::{ModelConfigSection, SkipConfig};
 use crate::rigid::Rigid;
 use crate::source::Frame;
+use crate::sync::clock::seconds_between;
 use crate::window::{PosedSet, Window, relative};
 use reuse::{Left, Reuse};
 use sky::SkyPatches;
@@ -75,6 +77,11 @@ impl ModelSource {
             return Ok(Self::Untrained { config: Box::new(config), seed: section.untrained_seed });
         };
         Ok(Self::Loaded { config: Box::new(config), tensors, name })
+    }
+
+    /// How long before each timestep the network's sweep has one more image, seconds; 0: there is no sweep, or it is not asked for.
+    pub fn prior_sec(&self, section: &ModelConfigSection) -> f64 {
+        if self.config().sweep_after_block > 0 { section.sweep_prior_sec } else { 0.0 }
     }
 
     /// The architecture.
@@ -282,18 +289,35 @@ impl Engine {
 
     /// One window as the network takes it.
     pub fn clip(&self, window: &Window<Frame>, cameras: &[Intrinsics]) -> Result<ClipBatch> {
-        let pictures: Vec<Vec<Vec<f32>>> = window
-            .steps
-            .iter()
-            .map(|set| set.frames.iter().map(|f| network_colors(&f.item.rgb.data)).collect())
-            .collect();
-        let views: Vec<Vec<ViewInput>> = (0..window.steps.len())
+        let all: Vec<&PosedSet<Frame>> = window.steps.iter().map(Arc::as_ref).collect();
+        let mut clip = self.batch(window, &all, cameras)?;
+        if self.model.config().sweep_after_block > 0 && window.priors() > 0 {
+            // A timestep without a prior set is its own: no time passes, and the sweep leaves it out.
+            let prior = |(own, prior): (&Arc<PosedSet<Frame>>, &Option<Arc<PosedSet<Frame>>>)| {
+                Arc::clone(prior.as_ref().filter(|p| p.frames.len() == own.frames.len()).unwrap_or(own))
+            };
+            let prior: Vec<_> = window.steps.iter().zip(&window.prior).map(prior).collect();
+            clip.prior =
+                Some(Box::new(self.batch(window, &prior.iter().map(Arc::as_ref).collect::<Vec<_>>(), cameras)?));
+        }
+        Ok(clip)
+    }
+
+    /// Sets of a window's clock and anchor as a batch of one.
+    fn batch(&self, window: &Window<Frame>, sets: &[&PosedSet<Frame>], cameras: &[Intrinsics]) -> Result<ClipBatch> {
+        let pictures: Vec<Vec<Vec<f32>>> =
+            sets.iter().map(|set| set.frames.iter().map(|f| network_colors(&f.item.rgb.data)).collect()).collect();
+        let views: Vec<Vec<ViewInput>> = (0..sets.len())
             .map(|t| {
                 let view = |c: usize| ViewInput {
                     rgb: &pictures[t][c],
                     intrinsics: cameras[c],
-                    world_from_camera: window.anchor_from_camera(t, c).snapped().to_f32(),
-                    time_sec: window.time_sec[t][c] as f32,
+                    world_from_camera: relative(&window.map_from_anchor, &sets[t].frames[c].map_from_camera)
+                        .snapped()
+                        .to_f32(),
+                    time_sec: (window.time_sec[t][c]
+                        + seconds_between(window.steps[t].frames[c].stamp_ns, sets[t].frames[c].stamp_ns))
+                        as f32,
                 };
                 (0..cameras.len().min(pictures[t].len())).map(view).collect()
             })

@@ -216,6 +216,7 @@ mod tests {
             epoch: 0,
             stamp_ns: steps.last().unwrap().stamp_ns,
             map_from_anchor: Rigid::new(glam::DQuat::IDENTITY, glam::DVec3::ZERO),
+            prior: Vec::new(),
             time_sec: vec![vec![0.0]; steps.len()],
             steps,
         }

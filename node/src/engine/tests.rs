@@ -26,7 +26,7 @@ fn numbers(scene: &Scene) -> Vec<(&'static str, Vec<f32>)> {
 fn a_batch_of_windows_gives_what_they_give_one_by_one() {
     let section = ModelConfigSection::default();
     let mut engine = Engine::new(ModelSource::open(&section).unwrap(), &section, 3, 2.0).unwrap();
-    let clips: Vec<Clip> = (3..6).map(|seed| Clip::of_seed(seed, (48, 32)).unwrap()).collect();
+    let clips: Vec<Clip> = (3..6).map(|seed| Clip::of_seed(seed, (48, 32), 0.0).unwrap()).collect();
     let windows: Vec<&Window<Frame>> = clips.iter().map(|c| &c.window).collect();
     // The drives' cameras differ from seed to seed; a replay's do not.
     let cameras = &clips[0].cameras;

@@ -79,7 +79,7 @@ impl Front {
         Self {
             sync: Synchronizer::new(rig.cameras.len(), &config.sync, &config.input.image_time_offset_sec),
             posed: PoseStage::new(store, rig, &config.sync),
-            window: WindowBuilder::new(&config.window, rig.reference),
+            window: WindowBuilder::new(&config.window, rig.reference).with_prior(config.model.sweep_prior_sec),
             lost: DropCounts::default(),
             messages_lost: 0,
             now_ns: None,

@@ -327,7 +327,7 @@ mod tests {
     #[test]
     fn a_batch_that_panics_is_run_one_by_one_and_a_window_that_does_is_lost_alone() {
         let config = Config::default();
-        let clips: Vec<Clip> = (3..6).map(|seed| Clip::of_seed(seed, (48, 32)).unwrap()).collect();
+        let clips: Vec<Clip> = (3..6).map(|seed| Clip::of_seed(seed, (48, 32), 0.0).unwrap()).collect();
         for (times, lost) in [(&[1][..], 0), (&[1, 3][..], 1)] {
             let source = ModelSource::open(&config.model).unwrap();
             let engine = Engine::new(source, &config.model, 3, config.window.timespan_sec).unwrap();
@@ -347,7 +347,7 @@ mod tests {
     fn another_map_is_given_what_the_one_before_was() {
         let mut config = Config::default();
         config.skip.check_every = 0;
-        let clip = Clip::of_seed(3, (48, 32)).unwrap();
+        let clip = Clip::of_seed(3, (48, 32), 0.0).unwrap();
         let source = ModelSource::open(&config.model).unwrap();
         let engine = Engine::new(source, &config.model, 3, config.window.timespan_sec).unwrap();
         let mut maker = StepMaker::new(engine, clip.cameras.clone(), &config, None).unwrap();

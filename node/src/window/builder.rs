@@ -41,6 +41,8 @@ pub struct WindowBuilder<T> {
     stride_ns: i64,
     tolerance_ns: u64,
     hop_ns: u64,
+    /// How long before each timestep a prior set is wanted; 0: none.
+    prior_ns: i64,
     reference_camera: usize,
     pub(super) history: VecDeque<Arc<PosedSet<T>>>,
     epoch: Option<u32>,
@@ -58,6 +60,7 @@ impl<T> WindowBuilder<T> {
             stride_ns: signed_ns(config.stride_sec).max(1),
             tolerance_ns: unsigned_ns(config.stride_sec * config.stride_tolerance),
             hop_ns: hop_ns(config.hop_sec),
+            prior_ns: 0,
             reference_camera,
             history: VecDeque::new(),
             epoch: None,
@@ -66,6 +69,13 @@ impl<T> WindowBuilder<T> {
             last_step_ns: None,
             counts: WindowCounts::default(),
         }
+    }
+
+    /// The same, with a set about `prior_sec` before each timestep (half as much more or less) where there is one; 0: without.
+    #[must_use]
+    pub fn with_prior(mut self, prior_sec: f64) -> Self {
+        self.prior_ns = signed_ns(prior_sec).max(0);
+        self
     }
 
     /// Least time between two windows from now on, seconds.
@@ -158,7 +168,8 @@ impl<T> WindowBuilder<T> {
             self.counts.malformed += 1;
             return false;
         }
-        let oldest_ns = self.place_ns(set.stamp_ns, self.timesteps - 1);
+        let oldest_ns =
+            self.place_ns(set.stamp_ns, self.timesteps - 1).saturating_sub(self.prior_ns + self.prior_ns / 2);
         self.history.push_back(Arc::new(set));
         let too_old = |stamp_ns: i64| stamp_ns < oldest_ns && stamp_ns.abs_diff(oldest_ns) > self.tolerance_ns;
         while self.history.front().is_some_and(|oldest| too_old(oldest.stamp_ns)) {
@@ -201,8 +212,16 @@ impl<T> WindowBuilder<T> {
         let steps: Vec<_> = picks.iter().map(|&i| Arc::clone(&self.history[i])).collect();
         let (first, newest) = (steps.first()?, steps.last()?);
         let map_from_anchor = first.frames.get(self.reference_camera)?.map_from_camera * camera_from_flu();
+        let prior = if self.prior_ns > 0 { picks.iter().map(|&i| self.prior_of(i)).collect() } else { Vec::new() };
         let since_first = |stamp_ns| seconds_between(first.stamp_ns, stamp_ns);
         let time_sec = steps.iter().map(|s| s.frames.iter().map(|f| since_first(f.stamp_ns)).collect()).collect();
-        Some(Window { epoch: newest.epoch, stamp_ns: newest.stamp_ns, map_from_anchor, time_sec, steps })
+        Some(Window { epoch: newest.epoch, stamp_ns: newest.stamp_ns, map_from_anchor, time_sec, prior, steps })
+    }
+
+    /// The set nearest to where the prior of a set in the history should lie, if it is near enough.
+    fn prior_of(&self, index: usize) -> Option<Arc<PosedSet<T>>> {
+        let place_ns = self.history[index].stamp_ns.saturating_sub(self.prior_ns);
+        let nearest = self.history.range(..index).min_by_key(|set| set.stamp_ns.abs_diff(place_ns))?;
+        (nearest.stamp_ns.abs_diff(place_ns) <= self.prior_ns.unsigned_abs() / 2).then(|| Arc::clone(nearest))
     }
 }

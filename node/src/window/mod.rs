@@ -47,6 +47,8 @@ pub struct Window<T> {
     pub map_from_anchor: Rigid,
     /// Oldest first.
     pub steps: Vec<Arc<PosedSet<T>>>,
+    /// Per timestep, the set shortly before it, for networks that sweep velocities; none where there is no such set. Empty: not asked for.
+    pub prior: Vec<Option<Arc<PosedSet<T>>>>,
     /// Per timestep and camera, seconds since the oldest timestep's reference stamp.
     pub time_sec: Vec<Vec<f64>>,
 }
@@ -59,6 +61,11 @@ impl<T> Window<T> {
     /// When the timestep or the camera does not exist.
     pub fn anchor_from_camera(&self, step: usize, camera: usize) -> Rigid {
         relative(&self.map_from_anchor, &self.steps[step].frames[camera].map_from_camera)
+    }
+
+    /// Timesteps that have a prior set.
+    pub fn priors(&self) -> usize {
+        self.prior.iter().flatten().count()
     }
 }
 

@@ -191,3 +191,20 @@ fn stages_fit_together_over_a_looped_recording() {
     assert_eq!(windows.iter().filter(|w| w.epoch == 1).count(), 35);
     assert_eq!((epoch, poses.counts().clock_jumps), (1, 1));
 }
+
+#[test]
+fn prior_sets_lie_shortly_before_their_timesteps_where_there_are_any() {
+    let mut b = WindowBuilder::new(&WindowConfig::default(), 0).with_prior(0.1);
+    let windows: Vec<_> = (0..30).filter_map(|i| b.push(plain(i * 100 * MS))).collect();
+    let priors =
+        |w: &Window<i64>| w.prior.iter().map(|p| p.as_ref().map(|s| s.stamp_ns / (100 * MS))).collect::<Vec<_>>();
+    // There is nothing before the first set; later windows have all four.
+    assert_eq!(priors(&windows[0]), [None, Some(4), Some(9), Some(14)]);
+    assert!(windows[1..].iter().all(|w| w.priors() == 4));
+    assert_eq!(priors(&windows[7]), [Some(6), Some(11), Some(16), Some(21)]);
+    // At 2 Hz no set is near enough, and without being asked there is none.
+    let mut slow = WindowBuilder::new(&WindowConfig::default(), 0).with_prior(0.1);
+    assert!((0..8).filter_map(|i| slow.push(plain(i * 500 * MS))).all(|w| w.prior.len() == 4 && w.priors() == 0));
+    let mut off = WindowBuilder::new(&WindowConfig::default(), 0);
+    assert!((0..30).filter_map(|i| off.push(plain(i * 100 * MS))).all(|w| w.prior.is_empty()));
+}

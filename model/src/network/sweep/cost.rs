@@ -106,6 +106,11 @@ impl Frame {
         }
     }
 
+    /// Whether both were taken at the same moment.
+    pub fn taken_with(&self, other: &Self) -> bool {
+        self.time_sec == other.time_sec
+    }
+
     /// Rows and columns.
     pub fn size(&self) -> (usize, usize) {
         (self.rows, self.cols)
@@ -114,7 +119,7 @@ impl Frame {
     /// Mean absolute difference of a colour to the one at `at` (camera coordinates), or [`UNSEEN`].
     #[inline]
     fn error(&self, color: [f32; 3], at: Vec3) -> f32 {
-        if !(at.z > NEAREST_M) {
+        if at.z <= NEAREST_M || at.z.is_nan() {
             return UNSEEN;
         }
         let [fx, fy, cx, cy] = self.focal;
@@ -203,7 +208,7 @@ fn scores(errors: &[f32], rows: usize, cols: usize) -> Vec<f32> {
                     let at = (j * cols + i) * CANDIDATES;
                     for (k, &e) in errors[at..at + CANDIDATES].iter().enumerate() {
                         let seen = if e >= 0.0 { 1.0 } else { 0.0 };
-                        sum[k] += e.max(0.0).min(WORST) * seen;
+                        sum[k] += e.clamp(0.0, WORST) * seen;
                         count[k] += seen;
                     }
                 }

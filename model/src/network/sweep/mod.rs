@@ -123,7 +123,8 @@ fn evidence(config: &ModelConfig, batch: &ClipBatch, first: usize, depths: &[f32
             let Some(frame) = own.get(at(step)) else { return };
             let before = step.checked_sub(1).and_then(|step| own.get(at(step)));
             let after = if step + 1 < t { own.get(at(step + 1)) } else { None };
-            let shortly = prior.as_ref().and_then(|prior| prior.get(at(step)));
+            // An image of the same moment stands for one that is missing.
+            let shortly = prior.as_ref().and_then(|prior| prior.get(at(step))).filter(|p| !p.taken_with(frame));
             for (source, other) in [before, after, shortly].into_iter().enumerate() {
                 let Some(other) = other else { continue };
                 let scores = sweep(frame, depth, along_ray, other);

@@ -273,10 +273,11 @@ fn write(args: &Args, report: &Report) -> Result<()> {
 }
 
 fn bag_clips(path: &Path, config: &Config, clips: usize) -> Result<Vec<Clip>> {
-    let size = ModelSource::open(&config.model)?.picture_size(&config.model)?;
+    let source = ModelSource::open(&config.model)?;
+    let (size, prior_sec) = (source.picture_size(&config.model)?, source.prior_sec(&config.model));
     let part = Part { from_sec: 0.0, to_sec: f64::INFINITY, clips: clips.max(1) };
     let mut all = Vec::new();
-    BagClips::open(path, config, size, &part)?.each(|clip| {
+    BagClips::open(path, config, size, prior_sec, &part)?.each(|clip| {
         all.push(clip);
         Ok(())
     })?;

@@ -77,9 +77,10 @@ pub(super) struct Data {
 impl Data {
     /// Held-out clips at the preset's picture size.
     pub fn held_out(config: &Config, clips: usize, bag: Vec<Clip>) -> Result<Self> {
-        let size = ModelSource::open(&config.model)?.picture_size(&config.model)?;
+        let source = ModelSource::open(&config.model)?;
+        let (size, prior_sec) = (source.picture_size(&config.model)?, source.prior_sec(&config.model));
         let seeds = crate::engine::evaluate::HELD_OUT_SEEDS;
-        let clips = seeds.take(clips.max(1)).map(|seed| Clip::of_seed(seed, size)).collect::<Result<_>>()?;
+        let clips = seeds.take(clips.max(1)).map(|seed| Clip::of_seed(seed, size, prior_sec)).collect::<Result<_>>()?;
         Ok(Self { clips, bag })
     }
 }
@@ -305,7 +306,7 @@ impl Gaps {
 pub(in crate::cmd) fn time_network(name: &str, section: &ModelConfigSection, runs: usize) -> Result<Setting> {
     let config = Config { model: section.clone(), ..Config::default() };
     let size = ModelSource::open(section)?.picture_size(section)?;
-    let data = Data { clips: vec![Clip::of_seed(SEED, size)?], bag: Vec::new() };
+    let data = Data { clips: vec![Clip::of_seed(SEED, size, 0.0)?], bag: Vec::new() };
     let subject = Subject { model: name, name: "default", set: &[], config: &config, beside: None };
     measure(&subject, &data, &mut References::new(), runs)
 }

@@ -12,7 +12,7 @@ use crate::output::atomic::write_bytes;
 use crate::output::plot::{self, Axis, Drawn, Panel, Series};
 
 /// Every loss term there is; those a run does not have stay empty.
-const TERMS: [&str; 18] = [
+const TERMS: [&str; 20] = [
     "rgb",
     "log_depth",
     "depth",
@@ -27,6 +27,8 @@ const TERMS: [&str; 18] = [
     "structure",
     "lpips",
     "sky_opacity",
+    "bases",
+    "swept_depth",
     "sky_depth",
     "opaque",
     "total",

@@ -58,11 +58,15 @@ pub struct BagClips {
 }
 
 impl BagClips {
-    /// Opens a bag and chooses clips; `size` is the network's picture size.
+    /// Opens a bag and chooses clips; `size` is the network's picture size, `prior_sec` how long before each timestep its sweep has one
+    /// more image (0: none), which is not held out then.
     ///
     /// # Errors
     /// A bag that cannot be read, or whose part holds no window with a frame that is not context.
-    pub fn open(path: &Path, config: &Config, size: (usize, usize), part: &Part) -> Result<Self> {
+    pub fn open(path: &Path, config: &Config, size: (usize, usize), prior_sec: f64, part: &Part) -> Result<Self> {
+        let mut config = config.clone();
+        config.model.sweep_prior_sec = prior_sec;
+        let config = &config;
         let source = BagSource::open(path, config, size)?;
         let (mut sets, mut windows) = (Vec::new(), Vec::new());
         run_front(&source, config, |output| {

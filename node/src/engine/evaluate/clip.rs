@@ -33,8 +33,17 @@ pub struct ClipFrame {
     pub set: Arc<PosedSet<Frame>>,
     /// What is true, per camera.
     pub truth: Vec<TruthAt>,
-    /// The timestep of the window it is; `None`: held out.
+    /// The timestep of the window it is; `None`: the network does not see it as an image of its window.
     pub context: Option<usize>,
+    /// Whether the network sees it as a prior image of a timestep: then it is not held out either.
+    pub prior: bool,
+}
+
+impl ClipFrame {
+    /// Whether it is scored as an image that the network has not seen.
+    pub fn held_out(&self) -> bool {
+        self.context.is_none() && !self.prior
+    }
 }
 
 /// One clip.
@@ -57,7 +66,9 @@ pub struct Clip {
 
 impl Clip {
     /// The clip of a seed, three cameras, at the network's picture size: frames 0, 5, 10 and 15 of 20 at 10 Hz are context.
-    pub fn of_seed(seed: u64, (width, height): (usize, usize)) -> Result<Self> {
+    ///
+    /// `prior_sec`: how long before each of them a prior image is, for networks that sweep velocities; 0: none.
+    pub fn of_seed(seed: u64, (width, height): (usize, usize), prior_sec: f64) -> Result<Self> {
         let seconds = CLIP_FRAMES as f64 / CLIP_HZ;
         let options =
             DriveOptions { seed, seconds, cameras: 3, width, height, rate_hz: CLIP_HZ, ..DriveOptions::default() };
@@ -65,7 +76,7 @@ impl Clip {
         let reference = 1;
         // Exactly frames 0, 5, 10 and 15: no tolerance.
         let config = WindowConfig { stride_tolerance: 0.01, ..WindowConfig::default() };
-        let mut builder = WindowBuilder::new(&config, reference);
+        let mut builder = WindowBuilder::new(&config, reference).with_prior(prior_sec);
         let mut window = None;
         let mut frames = Vec::with_capacity(CLIP_FRAMES);
         for i in 0..CLIP_FRAMES {
@@ -93,8 +104,12 @@ impl Clip {
         tracks: Vec<TrackTruth>,
     ) -> Self {
         let context = |stamp_ns: i64| window.steps.iter().position(|s| s.stamp_ns == stamp_ns);
-        let frames =
-            frames.into_iter().map(|(set, truth)| ClipFrame { context: context(set.stamp_ns), set, truth }).collect();
+        let prior = |stamp_ns: i64| window.prior.iter().flatten().any(|s| s.stamp_ns == stamp_ns);
+        let frame = |(set, truth): (Arc<PosedSet<Frame>>, Vec<TruthAt>)| {
+            let (context, prior) = (context(set.stamp_ns), prior(set.stamp_ns));
+            ClipFrame { set, truth, context, prior }
+        };
+        let frames = frames.into_iter().map(frame).collect();
         Self { name, seed, window, reference, frames, cameras, tracks }
     }
 

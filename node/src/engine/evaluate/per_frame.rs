@@ -30,6 +30,7 @@ pub(super) fn scenes(clip: &Clip, engine: &mut Engine, which: Use) -> Result<Vec
             stamp_ns: set.stamp_ns,
             map_from_anchor: reference.map_from_camera * camera_from_flu(),
             steps: vec![set.clone()],
+            prior: Vec::new(),
             time_sec: vec![vec![0.0; set.frames.len()]],
         };
         let scene = still(engine.step(&window, &clip.cameras)?);

@@ -53,7 +53,7 @@ mod tests {
 
     #[test]
     fn clips_scored_apart_join_to_the_figures_of_all() {
-        let clips: Vec<Clip> = (0..3).map(|seed| Clip::of_seed(seed, (32, 16)).unwrap()).collect();
+        let clips: Vec<Clip> = (0..3).map(|seed| Clip::of_seed(seed, (32, 16), 0.0).unwrap()).collect();
         let scored = |clips: &[Clip]| {
             let mut tally = Tally::default();
             clips.iter().for_each(|clip| tally.add(clip, &Prediction::NearestContext, Some(2.0)).unwrap());

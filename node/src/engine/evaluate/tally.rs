@@ -169,7 +169,7 @@ impl Tally {
 
     /// Held-out frames answered with the nearest context picture of the same camera.
     fn nearest(&mut self, clip: &Clip) -> Result<()> {
-        for frame in clip.frames.iter().filter(|f| f.context.is_none()) {
+        for frame in clip.frames.iter().filter(|f| f.held_out()) {
             for (camera, (seen, truth)) in frame.set.frames.iter().zip(&frame.truth).enumerate() {
                 let context = clip.window.steps.iter().filter_map(|s| s.frames.get(camera));
                 let Some(nearest) = context.min_by_key(|f| f.stamp_ns.abs_diff(seen.stamp_ns)) else { continue };

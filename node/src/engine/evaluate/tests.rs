@@ -38,7 +38,7 @@ fn of(all: &[(Method, Figures)], method: Method) -> &Figures {
 
 #[test]
 fn every_method_gives_the_same_figures_twice_whatever_the_threads() {
-    let clip = Clip::of_seed(SEED, SIZE).unwrap();
+    let clip = Clip::of_seed(SEED, SIZE, 0.0).unwrap();
     let pool = |n| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
     let clips = [clip];
     let one = pool(1).install(|| evaluate(&clips, &Method::ALL));
@@ -55,7 +55,7 @@ fn every_method_gives_the_same_figures_twice_whatever_the_threads() {
 
 #[test]
 fn ceilings_lie_above_what_knows_no_motion() {
-    let clip = Clip::of_seed(SEED, SIZE).unwrap();
+    let clip = Clip::of_seed(SEED, SIZE, 0.0).unwrap();
     let methods = [Method::Static, Method::ConstantVelocity, Method::OracleGeometry];
     let all = evaluate(&[clip], &methods);
     let still = of(&all, Method::Static);
@@ -72,7 +72,7 @@ fn ceilings_lie_above_what_knows_no_motion() {
 
 #[test]
 fn a_frame_that_equals_its_context_is_answered_perfectly_by_it() {
-    let mut clip = Clip::of_seed(SEED, SIZE).unwrap();
+    let mut clip = Clip::of_seed(SEED, SIZE, 0.0).unwrap();
     // Frame 1 becomes a copy of frame 0 but for one grey level in one value.
     let mut copy = (*clip.frames[0].set).clone();
     let mut rgb = (*copy.frames[0].item.rgb).clone();
@@ -102,7 +102,7 @@ fn a_bag_with_ground_truth_is_scored_like_the_drive_it_holds() {
         if !path.exists() {
             write_drive(&Drive::new(&options).unwrap(), &path, &SynthOptions::default(), &mut |_, _| {}).unwrap();
         }
-        BagClips::open(&path, &Config::default(), SIZE, part)
+        BagClips::open(&path, &Config::default(), SIZE, 0.0, part)
     };
     let all = Part { from_sec: 0.0, to_sec: f64::INFINITY, clips: 4 };
     let cut = |seconds: f64, part: &Part| {
@@ -123,7 +123,7 @@ fn a_bag_with_ground_truth_is_scored_like_the_drive_it_holds() {
     assert_eq!((clips[0].frames.len(), context), (20, vec![0, 5, 10, 15]));
     let methods = [Method::OracleGeometry, Method::NearestContext];
     let from_bag = timeless(evaluate(&clips, &methods));
-    let mut drive = Clip::of_seed(SEED, SIZE).unwrap();
+    let mut drive = Clip::of_seed(SEED, SIZE, 0.0).unwrap();
     drive.tracks.clear();
     let from_drive = timeless(evaluate(&[drive], &methods));
     // The bag's poses are stored rounded to quaternions; everything else is the same.

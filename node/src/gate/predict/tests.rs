@@ -85,6 +85,7 @@ fn window(k: i64, rgb: RgbPicture) -> Window<Frame> {
         stamp_ns,
         map_from_anchor: Rigid::IDENTITY,
         steps: vec![Arc::new(PosedSet { stamp_ns, epoch: 0, frames: vec![frame] })],
+        prior: Vec::new(),
         time_sec: vec![vec![0.0]],
     }
 }
