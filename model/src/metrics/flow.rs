@@ -28,11 +28,11 @@ pub const AV2_DYNAMIC_MPS: f64 = 0.5;
 /// A flow vector, m/s.
 pub type Flow = [f32; 3];
 
-fn norm(v: [f64; 3]) -> f64 {
+pub(crate) fn norm(v: [f64; 3]) -> f64 {
     (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt()
 }
 
-fn widen(name: &'static str, index: usize, v: Flow) -> Result<[f64; 3], MetricError> {
+pub(super) fn widen(name: &'static str, index: usize, v: Flow) -> Result<[f64; 3], MetricError> {
     check_finite(name, index, v.iter().map(|&x| f64::from(x)).sum())?;
     Ok(v.map(f64::from))
 }
@@ -52,7 +52,7 @@ fn pairs<'a>(
     Ok(counted.map(|i| Ok((widen("predicted flow", i, pred[i])?, widen("true flow", i, truth[i])?))))
 }
 
-fn difference(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+pub(super) fn difference(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 

@@ -30,11 +30,11 @@ pub struct Image<'a> {
 }
 
 impl Image<'_> {
-    fn pixels(&self) -> usize {
+    pub(super) fn pixels(&self) -> usize {
         self.width.saturating_mul(self.height)
     }
 
-    fn check(&self, name: &'static str, like: &Self, mask: Option<&[bool]>) -> Result<(), MetricError> {
+    pub(super) fn check(&self, name: &'static str, like: &Self, mask: Option<&[bool]>) -> Result<(), MetricError> {
         check_len(name, self.values.len(), self.pixels().saturating_mul(self.channels))?;
         check_len(name, self.width, like.width)?;
         check_len(name, self.height, like.height)?;

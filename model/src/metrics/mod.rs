@@ -4,11 +4,14 @@
 //! is not finite, or of another size than it should be, is an error. The definitions are those of the paper's own
 //! evaluation where there is one, checked against numbers it produced (`tests/fixtures/*_metrics*`).
 
+pub mod bases;
 pub mod flow;
 #[cfg(test)]
 mod goldens;
 pub mod image;
 pub mod mask;
+pub mod mends;
+pub mod movers;
 pub mod track;
 
 /// Why a figure cannot be computed.

@@ -1,12 +1,14 @@
 //! One window's result as plain numbers: no tensor library from here on.
 
 mod affine;
+mod affine_fit;
 mod render;
 mod sky;
 
 use std::sync::Arc;
 
 pub use affine::Affine;
+pub use affine_fit::AffineFit;
 pub(crate) use render::fade_weights;
 pub use render::{RenderedView, Want};
 pub use sky::SkyModel;

@@ -24,6 +24,8 @@ pub struct Truth {
     pub sky: Tensor,
     /// 1 where the surface moves.
     pub moving: Tensor,
+    /// 1 on road users, moving or not.
+    pub user: Tensor,
     /// 1 where `sky` is a label, 0 where nobody said.
     pub sky_known: Tensor,
     /// 1 where `flow` and `moving` are labels.
@@ -55,6 +57,7 @@ impl Truth {
         let mut distance = Vec::with_capacity(count);
         let mut flow = Vec::with_capacity(3 * count);
         let (mut sky, mut moving) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        let mut user = Vec::with_capacity(count);
         let rotation = anchor_from_map.as_mat3();
         for Shot { frame, intrinsics, .. } in shots.iter().flatten() {
             for (i, &z) in frame.depth.iter().enumerate() {
@@ -70,6 +73,7 @@ impl Truth {
             flow.extend(frame.flow.iter().flat_map(|&f| (rotation * glam::Vec3::from(f)).to_array()));
             sky.extend(frame.sky.iter().map(|&x| f32::from(x)));
             moving.extend(frame.moving.iter().map(|&x| f32::from(x)));
+            user.extend(frame.instance.iter().map(|&x| f32::from(u8::from(x != 0))));
         }
         let shape = (1, t, v, h, w);
         let plane = |x: Vec<f32>| Tensor::from_vec(x, shape, &Device::Cpu);
@@ -79,6 +83,7 @@ impl Truth {
             flow: Tensor::from_vec(flow, (1, t, v, h, w, 3), &Device::Cpu)?,
             sky: plane(sky)?,
             moving: plane(moving)?,
+            user: plane(user)?,
             sky_known: plane(vec![1.0; count])?,
             flow_known: plane(vec![1.0; count])?,
         })
@@ -92,6 +97,7 @@ impl Truth {
             flow: cat(|x| &x.flow)?,
             sky: cat(|x| &x.sky)?,
             moving: cat(|x| &x.moving)?,
+            user: cat(|x| &x.user)?,
             sky_known: cat(|x| &x.sky_known)?,
             flow_known: cat(|x| &x.flow_known)?,
         })
@@ -105,6 +111,7 @@ impl Truth {
             flow: to(&self.flow)?,
             sky: to(&self.sky)?,
             moving: to(&self.moving)?,
+            user: to(&self.user)?,
             sky_known: to(&self.sky_known)?,
             flow_known: to(&self.flow_known)?,
         })

@@ -63,7 +63,7 @@ pub struct Args {
     /// Write the figures as JSON.
     #[arg(long)]
     json: Option<PathBuf>,
-    /// Write the table as Markdown.
+    /// Write the tables as Markdown: the figures, then where the error is.
     #[arg(long)]
     markdown: Option<PathBuf>,
 }
@@ -151,9 +151,11 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         size.0,
         size.1
     );
-    say_text!("{}", table::text(&named, spread));
+    let breakdowns = evaluation.breakdowns();
+    let causes: Vec<(&str, _)> = breakdowns.iter().map(|(method, b)| (method.name(), b)).collect();
+    say_text!("{}{}", table::text(&named, spread), table::where_text(&causes));
     if let Some(path) = &args.markdown {
-        write(path, &table::markdown(&named, spread))?;
+        write(path, &(table::markdown(&named, spread) + &table::where_markdown(&causes)))?;
     }
     if let Some(path) = &args.json {
         let mut report = json!({
@@ -166,6 +168,9 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         data.note(&mut report);
         for (name, figures) in &named {
             report[*name] = serde_json::to_value(figures)?;
+        }
+        for (name, breakdown) in &causes {
+            report["where"][*name] = serde_json::to_value(breakdown)?;
         }
         for (method, errors) in &errors {
             report["standard_errors"][method.name()] = serde_json::to_value(errors)?;

@@ -36,6 +36,8 @@ pub struct Figures {
     pub epe3d_foreground_static: Option<f64>,
     /// End-point error of the surroundings, m/s.
     pub epe3d_background_static: Option<f64>,
+    /// Share of moving road users' pixels that are missed (below 1 m/s, in truth above 2), 0 to 1.
+    pub missed_share: Option<f64>,
     /// Foreground adjusted Rand index of the motion masks on context frames.
     pub fg_ari: Option<f64>,
     /// Intersection over union of moving pixels on context frames, 0 to 1.
@@ -48,7 +50,7 @@ pub struct Figures {
 
 impl Figures {
     /// Name, unit and value of each.
-    pub fn rows(&self) -> [(&'static str, &'static str, Option<f64>); 19] {
+    pub fn rows(&self) -> [(&'static str, &'static str, Option<f64>); 20] {
         [
             ("PSNR", "dB", self.psnr),
             ("PSNR, moving", "dB", self.psnr_dynamic),
@@ -65,6 +67,7 @@ impl Figures {
             ("EPE3D, moving users", "m/s", self.epe3d_foreground_dynamic),
             ("EPE3D, still users", "m/s", self.epe3d_foreground_static),
             ("EPE3D, background", "m/s", self.epe3d_background_static),
+            ("movers missed", "", self.missed_share),
             ("foreground ARI", "", self.fg_ari),
             ("moving IoU", "", self.moving_iou),
             ("APD3D", "", self.apd3d),
@@ -73,7 +76,7 @@ impl Figures {
     }
 
     /// Each, in the order of [`Self::rows`].
-    pub(super) fn values_mut(&mut self) -> [&mut Option<f64>; 19] {
+    pub(super) fn values_mut(&mut self) -> [&mut Option<f64>; 20] {
         [
             &mut self.psnr,
             &mut self.psnr_dynamic,
@@ -90,6 +93,7 @@ impl Figures {
             &mut self.epe3d_foreground_dynamic,
             &mut self.epe3d_foreground_static,
             &mut self.epe3d_background_static,
+            &mut self.missed_share,
             &mut self.fg_ari,
             &mut self.moving_iou,
             &mut self.apd3d,

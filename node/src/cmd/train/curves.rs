@@ -38,15 +38,27 @@ const TERMS: [&str; 20] = [
 /// Columns after the terms: how long the step took, seconds.
 const REST: [&str; 5] = ["gradient_norm", "wait_sec", "forward_sec", "backward_sec", "update_sec"];
 
-const FIGURES: [&str; 8] = [
-    "depth_relative",
-    "depth_rmse",
-    "epe3d",
-    "epe3d_moving",
-    "epe3d_moving_still",
-    "psnr",
-    "opacity_surface",
-    "opacity_sky",
+/// A column of `validation.csv` and its value.
+type Figure = (&'static str, fn(&Validation) -> Option<f64>);
+
+const FIGURES: [Figure; 17] = [
+    ("depth_relative", |v| v.depth_relative),
+    ("depth_rmse", |v| v.depth_rmse),
+    ("epe3d", |v| v.epe3d),
+    ("epe3d_moving", |v| v.epe3d_moving),
+    ("epe3d_moving_still", |v| v.epe3d_moving_still),
+    ("psnr", |v| v.psnr),
+    ("opacity_surface", |v| v.opacity_surface),
+    ("opacity_sky", |v| v.opacity_sky),
+    ("missed_share", |v| v.missed_share),
+    ("speed_error", |v| v.speed_error),
+    ("direction_error", |v| v.direction_error),
+    ("epe3d_foreground_dynamic", |v| v.epe3d_foreground_dynamic),
+    ("epe3d_foreground_static", |v| v.epe3d_foreground_static),
+    ("epe3d_background_static", |v| v.epe3d_background_static),
+    ("moving_iou", |v| v.moving_iou),
+    ("bases_from_fan", |v| v.bases_from_fan),
+    ("bases_between_clips", |v| v.bases_between_clips),
 ];
 
 /// Points drawn per line; more are averaged.
@@ -64,11 +76,16 @@ impl Table {
     /// Opens a table and drops what an earlier run wrote from step `first` on (it is trained again).
     pub fn open(path: PathBuf, columns: &[&str], first: u64) -> Result<Self> {
         let text = std::fs::read_to_string(&path).unwrap_or_default();
+        // A run of an earlier version had fewer columns: they are found by their names.
+        let header: Vec<&str> = text.lines().next().unwrap_or_default().split(',').skip(1).collect();
+        let places: Vec<Option<usize>> = columns.iter().map(|c| header.iter().position(|h| h == c)).collect();
         let row = |line: &str| {
             let mut cells = line.split(',');
             let step: u64 = cells.next()?.parse().ok()?;
-            let values: Vec<Option<f64>> = cells.map(|c| c.parse().ok()).collect();
-            (step < first && values.len() == columns.len()).then_some((step, values))
+            let found: Vec<Option<f64>> = cells.map(|c| c.parse().ok()).collect();
+            let values: Vec<Option<f64>> =
+                places.iter().map(|place| place.and_then(|p| found.get(p).copied().flatten())).collect();
+            (step < first && found.len() == header.len()).then_some((step, values))
         };
         let rows: Vec<_> = text.lines().skip(1).filter_map(row).collect();
         let mut whole = format!("step,{}\n", columns.join(","));
@@ -126,7 +143,7 @@ impl Curves {
         let columns: Vec<&str> = TERMS.iter().chain(&REST).copied().collect();
         Ok(Self {
             losses: Table::open(folder.join("losses.csv"), &columns, first)?,
-            figures: Table::open(folder.join("validation.csv"), &FIGURES, first + 1)?,
+            figures: Table::open(folder.join("validation.csv"), &FIGURES.map(|(name, _)| name), first + 1)?,
             picture: folder.join("curves.svg"),
         })
     }
@@ -145,16 +162,7 @@ impl Curves {
 
     /// Error figures after `steps` steps; also draws the picture anew.
     pub fn validation(&mut self, steps: u64, v: &Validation) -> Result<()> {
-        let values = vec![
-            v.depth_relative,
-            v.depth_rmse,
-            v.epe3d,
-            v.epe3d_moving,
-            v.epe3d_moving_still,
-            v.psnr,
-            v.opacity_surface,
-            v.opacity_sky,
-        ];
+        let values = FIGURES.iter().map(|(_, value)| value(v)).collect();
         self.figures.push(steps, values)?;
         self.draw()
     }
@@ -167,16 +175,20 @@ impl Curves {
             .map(|(k, name)| (*name, self.losses.series(k)))
             .filter(|(_, points)| !points.is_empty())
             .collect();
-        let figure = |k: usize| (FIGURES[k], self.figures.series(k));
+        let figure = |wanted: &'static str| {
+            let column = FIGURES.iter().position(|(name, _)| *name == wanted);
+            (wanted, column.map_or(Vec::new(), |k| self.figures.series(k)))
+        };
         let panels = [
             panel("Loss terms (weighted, logarithmic)", &losses, true),
-            panel("Held-out depth error over depth", &[figure(0)], false),
+            panel("Held-out depth error over depth", &[figure("depth_relative")], false),
             panel(
                 "Held-out velocity error of moving pixels, m/s (dashes: taken as still)",
-                &[figure(3), figure(4)],
+                &[figure("epe3d_moving"), figure("epe3d_moving_still")],
                 false,
             ),
-            panel("Held-out PSNR of rendered pictures, dB", &[figure(5)], false),
+            panel("Share of moving road users' pixels that are missed", &[figure("missed_share")], false),
+            panel("Held-out PSNR of rendered pictures, dB", &[figure("psnr")], false),
         ];
         Ok(write_bytes(&self.picture, plot::svg(&panels).as_bytes())?)
     }
@@ -199,12 +211,19 @@ fn panel(title: &str, lines: &[(&str, Vec<(f64, f64)>)], log: bool) -> Panel {
 pub(super) fn describe(v: &Validation) -> String {
     let one = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.3}"));
     format!(
-        "depth error {} (RMSE {} m), velocity error {} m/s, of movers {} (taken as still {}), PSNR {} dB, opacity {} on surfaces, {} in the sky",
+        "depth error {} (RMSE {} m), velocity error {} m/s, of movers {} (taken as still {}), missed {} of them, speed error \
+         {} m/s, direction error {} rad; velocity bases {} m/s from their start, {} between clips; PSNR {} dB, opacity {} on \
+         surfaces, {} in the sky",
         one(v.depth_relative),
         one(v.depth_rmse),
         one(v.epe3d),
         one(v.epe3d_moving),
         one(v.epe3d_moving_still),
+        one(v.missed_share),
+        one(v.speed_error),
+        one(v.direction_error),
+        one(v.bases_from_fan),
+        one(v.bases_between_clips),
         one(v.psnr),
         one(v.opacity_surface),
         one(v.opacity_sky)
@@ -227,19 +246,28 @@ mod tests {
     }
 
     #[test]
+    fn a_table_of_an_earlier_version_keeps_its_columns() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("table.csv");
+        std::fs::write(&path, "step,gone,psnr,epe3d\n10,1.0,20.5,\n20,1.0,21.5,0.5\n30,2.0,23.0\n").unwrap();
+        let table = Table::open(path.clone(), &["epe3d", "missed_share", "psnr"], 100).unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert_eq!(text, "step,epe3d,missed_share,psnr\n10,,,2.050000e1\n20,5.000000e-1,,2.150000e1\n");
+        assert_eq!(table.series(2), [(10.0, 20.5), (20.0, 21.5)]);
+    }
+
+    #[test]
     fn a_resumed_run_continues_its_tables() {
         let dir = tempfile::tempdir().unwrap();
         let mut curves = Curves::open(dir.path(), 0).unwrap();
         (0..6).for_each(|k| curves.step(&report(k), 0.05).unwrap());
         let v = Validation {
             depth_relative: Some(0.3),
-            depth_rmse: None,
-            epe3d: Some(1.0),
             epe3d_moving: Some(4.0),
             epe3d_moving_still: Some(5.0),
+            missed_share: Some(0.24),
             psnr: Some(20.0),
-            opacity_surface: Some(0.9),
-            opacity_sky: None,
+            ..Validation::default()
         };
         curves.validation(6, &v).unwrap();
         drop(curves);
@@ -255,6 +283,10 @@ mod tests {
         let validation = std::fs::read_to_string(dir.path().join("validation.csv")).unwrap();
         assert_eq!(validation.lines().count(), 2, "{validation}");
         let svg = std::fs::read_to_string(dir.path().join("curves.svg")).unwrap();
+        assert!(
+            validation.starts_with("step,depth_relative,") && validation.contains(",missed_share,"),
+            "{validation}"
+        );
         assert!(svg.contains("flow") && svg.contains("PSNR") && !svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
 }

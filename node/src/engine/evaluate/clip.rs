@@ -1,10 +1,11 @@
 //! One clip: its context window, all frames in and after it, and what is true of them.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use glam::Vec3;
-use storm_render::world::{Drive, DriveOptions, TrajectoryOptions};
+use storm_render::world::{Drive, DriveOptions, MoverClass, TrajectoryOptions};
 use storm_render::{Intrinsics, View};
 
 use super::tracks::TrackTruth;
@@ -62,6 +63,8 @@ pub struct Clip {
     pub cameras: Vec<Intrinsics>,
     /// Followed surface points; none in recordings.
     pub tracks: Vec<TrackTruth>,
+    /// Classes of road users by object number; none in recordings.
+    pub classes: BTreeMap<u16, MoverClass>,
 }
 
 impl Clip {
@@ -90,7 +93,10 @@ impl Clip {
         let times_sec = window.steps.iter().map(|s| s.stamp_ns as f64 * 1e-9).collect();
         let wanted = TrajectoryOptions { times_sec, points: TRACKED_POINTS, moving_share: 0.5, seed };
         let tracks = TrackTruth::of_drive(&drive.trajectories(&wanted), &window);
-        Ok(Self::new(format!("seed {seed}"), seed, window, reference, frames, cameras, tracks))
+        let movers = (0..CLIP_FRAMES).flat_map(|i| drive.movers(drive.frame_time_sec(i, reference)));
+        let classes = movers.map(|mover| (mover.instance, mover.class)).collect();
+        let clip = Self::new(format!("seed {seed}"), seed, window, reference, frames, cameras, tracks);
+        Ok(Self { classes, ..clip })
     }
 
     /// From its parts; which frames are context follows from the window.
@@ -110,7 +116,7 @@ impl Clip {
             ClipFrame { set, truth, context, prior }
         };
         let frames = frames.into_iter().map(frame).collect();
-        Self { name, seed, window, reference, frames, cameras, tracks }
+        Self { name, seed, window, reference, frames, cameras, tracks, classes: BTreeMap::new() }
     }
 
     /// Seconds since the window's first timestep.

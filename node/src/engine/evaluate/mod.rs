@@ -5,6 +5,7 @@
 //! [`Figures`].
 
 pub mod bag;
+mod breakdown;
 pub(crate) mod clip;
 mod gs3d;
 mod method;
@@ -23,6 +24,7 @@ use std::time::Instant;
 use anyhow::{Context, Result};
 use storm_model::scene::Scene;
 
+pub use breakdown::{BinFigures, BreakdownFigures};
 pub use clip::{CLIP_FRAMES, CLIP_HZ, Clip, ClipFrame, HELD_OUT_SEEDS, TAIL_SEC};
 pub use method::Method;
 pub use prediction::{Placed, Prediction};
@@ -119,6 +121,11 @@ impl Evaluation {
     /// The standard errors of [`Self::figures`] over the clips: how far other clips of the same kind would put them.
     pub fn standard_errors(&self) -> Vec<(Method, Figures)> {
         self.tallies.iter().map(|(method, clips)| (*method, spread::standard_errors(clips))).collect()
+    }
+
+    /// Where every method's error is, in the order of [`Self::figures`].
+    pub fn breakdowns(&self) -> Vec<(Method, BreakdownFigures)> {
+        self.tallies.iter().map(|(method, clips)| (*method, spread::whole(clips).breakdown())).collect()
     }
 
     /// Held-out pictures scored (by whichever method scored most).

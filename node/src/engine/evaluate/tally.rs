@@ -4,12 +4,14 @@ use anyhow::Result;
 use glam::Vec3;
 use storm_model::metrics::Mean;
 use storm_model::metrics::flow::{AV2_DYNAMIC_MPS, Flow, FlowEvaluation, FlowFrame, three_way_epe};
-use storm_model::metrics::image::ImageScores;
+use storm_model::metrics::image::{Image, ImageScores};
 use storm_model::metrics::mask::{foreground_ari, iou};
+use storm_model::metrics::mends::Mends;
 use storm_model::scene::{RenderedView, Want};
 use storm_render::View;
 use storm_render::raster::CpuRasterizer;
 
+use super::breakdown::{Breakdown, BreakdownFigures, FlowPixel};
 use super::clip::unproject;
 use super::tracks::{StepCloud, apd3d};
 use super::{Clip, ClipFrame, Placed, Prediction};
@@ -31,6 +33,7 @@ pub struct Tally {
     moving_iou: Mean,
     apd3d: Mean,
     ms: Mean,
+    breakdown: Breakdown,
 }
 
 /// One context timestep, all cameras pooled; only cameras whose depth and flow are known.
@@ -39,7 +42,10 @@ struct StepFlow {
     pred: Vec<Flow>,
     truth: Vec<Flow>,
     depth: Vec<f32>,
-    foreground: Vec<bool>,
+    /// Empty where the method has no depth.
+    pred_depth: Vec<f32>,
+    /// Object numbers; empty where they are unknown.
+    instance: Vec<u16>,
 }
 
 /// Motion masks of one context timestep, all cameras pooled; only cameras whose truth is known.
@@ -67,12 +73,18 @@ impl Tally {
             epe3d_foreground_dynamic: dynamic,
             epe3d_foreground_static: still,
             epe3d_background_static: background,
+            missed_share: self.breakdown.movers().missed_share,
             fg_ari: self.ari.value(),
             moving_iou: self.moving_iou.value(),
             apd3d: self.apd3d.value(),
             ms: self.ms.value(),
             ..Figures::of_images(&self.images)
         }
+    }
+
+    /// Where the error is.
+    pub fn breakdown(&self) -> BreakdownFigures {
+        self.breakdown.figures()
     }
 
     /// Counts what the other counted too.
@@ -84,6 +96,7 @@ impl Tally {
         self.moving_iou.join(&other.moving_iou);
         self.apd3d.join(&other.apd3d);
         self.ms.join(&other.ms);
+        self.breakdown.join(&other.breakdown);
     }
 
     /// Held-out pictures scored.
@@ -104,6 +117,7 @@ impl Tally {
     /// Held-out frames drawn, then flow, masks and trajectories of the context frames.
     fn scenes(&mut self, clip: &Clip, scenes: &[Placed]) -> Result<()> {
         let Some(first) = scenes.first() else { return Ok(()) };
+        scenes.iter().for_each(|s| self.breakdown.bases().add(&s.scene.motion_bases, &s.scene.config));
         let mut raster = CpuRasterizer::new(first.scene.raster_settings())?;
         let mut flows = Vec::new();
         let mut clouds = Vec::new();
@@ -113,8 +127,8 @@ impl Tally {
             let views = draw(placed, clip, frame, &mut raster)?;
             let Some(step) = frame.context else {
                 for ((view, truth), seen) in views.iter().zip(&frame.truth).zip(&frame.set.frames) {
-                    let true01 = unit(&seen.item.rgb.data);
-                    self.images.push(truth.compare(&unit(&view.rgb8()), &true01, Some(&view.depth))?);
+                    let (pred, true01) = (unit(&view.rgb8()), unit(&seen.item.rgb.data));
+                    self.image(clip, truth, &pred, &true01, Some(view))?;
                 }
                 continue;
             };
@@ -123,7 +137,7 @@ impl Tally {
             for (view, truth) in views.iter().zip(&frame.truth) {
                 let pred: Vec<Flow> =
                     view.flow.iter().flatten().map(|&f| (map_from_anchor * Vec3::from(f)).to_array()).collect();
-                flow.add(truth, &pred);
+                flow.add(truth, &pred, Some(&view.depth));
                 let groups: Vec<u32> = motion_mask(view).into_iter().map(u32::from).collect();
                 mask.add(truth, groups.iter().map(|&g| g != 0), Some(&groups));
             }
@@ -136,7 +150,7 @@ impl Tally {
                 false => drawn_cloud(clip, step, &views),
             });
         }
-        self.flows(&flows)?;
+        self.flows(clip, &flows)?;
         self.apd3d.add(apd3d(clip, &clouds)?);
         Ok(())
     }
@@ -150,7 +164,7 @@ impl Tally {
             let (mut pooled, mut mask, mut cloud) = (StepFlow::default(), StepMask::default(), StepCloud::default());
             for (camera, (view, truth)) in clip.views(step).iter().zip(&frame.truth).enumerate() {
                 let Some(pred) = flow.get(step).and_then(|cameras| cameras.get(camera)) else { continue };
-                pooled.add(truth, pred);
+                pooled.add(truth, pred, None);
                 mask.add(truth, pred.iter().map(|&f| Vec3::from(f).length() >= MOVING_MPS), None);
                 let Some(depth) = &truth.depth else { continue };
                 for (i, (&z, &f)) in depth.iter().zip(pred).enumerate() {
@@ -162,7 +176,7 @@ impl Tally {
             self.mask(&mask)?;
             clouds.push(cloud);
         }
-        self.flows(&flows)?;
+        self.flows(clip, &flows)?;
         self.apd3d.add(apd3d(clip, &clouds)?);
         Ok(())
     }
@@ -174,19 +188,59 @@ impl Tally {
                 let context = clip.window.steps.iter().filter_map(|s| s.frames.get(camera));
                 let Some(nearest) = context.min_by_key(|f| f.stamp_ns.abs_diff(seen.stamp_ns)) else { continue };
                 let (pred, true01) = (unit(&nearest.item.rgb.data), unit(&seen.item.rgb.data));
-                self.images.push(truth.compare(&pred, &true01, None)?);
+                self.image(clip, truth, &pred, &true01, None)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// One held-out image, colours 0-1; `view` is the rendering it comes from, if it is one.
+    fn image(
+        &mut self,
+        clip: &Clip,
+        truth: &TruthAt,
+        pred: &[f32],
+        true01: &[f32],
+        view: Option<&RenderedView>,
+    ) -> Result<()> {
+        self.images.push(truth.compare(pred, true01, view.map(|view| view.depth.as_slice()))?);
+        let image = |values| Image { width: truth.size.0, height: truth.size.1, channels: 3, values };
+        // Where nobody says what is sky, it is what the rendering leaves to the sky.
+        let known = truth.sky.as_ref().map(|sky| sky.iter().map(|&s| s != 0).collect());
+        let sky: Option<Vec<bool>> =
+            known.or_else(|| view.map(|view| view.alpha.iter().map(|&a| a < SURFACE_OPACITY).collect()));
+        self.breakdown.mends(Mends::of(&image(pred), &image(true01), sky.as_deref())?);
+        for (i, &z) in truth.depth.iter().flatten().enumerate().filter(|(_, z)| **z > 0.0) {
+            let channels = 3 * i..3 * i + 3;
+            if let (Some(p), Some(t)) = (pred.get(channels.clone()), true01.get(channels)) {
+                let id = truth.instance.as_ref().and_then(|ids| ids.get(i));
+                self.breakdown.color(p, t, z, id.and_then(|id| clip.classes.get(id).copied()));
             }
         }
         Ok(())
     }
 
     /// The context timesteps of one clip are one sample, as in the paper's program.
-    fn flows(&mut self, flows: &[StepFlow]) -> Result<()> {
+    fn flows(&mut self, clip: &Clip, flows: &[StepFlow]) -> Result<()> {
         let known: Vec<&StepFlow> = flows.iter().filter(|f| !f.truth.is_empty()).collect();
         let frame = |f: &&StepFlow| -> Vec<bool> { f.depth.iter().map(|&d| d > 0.0).collect() };
         for f in &known {
-            if f.foreground.len() == f.truth.len() {
-                let kinds = three_way_epe(&f.pred, &f.truth, &f.foreground, Some(&frame(f)), AV2_DYNAMIC_MPS)?;
+            let instances = Some(&f.instance).filter(|ids| ids.len() == f.truth.len());
+            for i in (0..f.truth.len()).filter(|&i| f.depth[i] > 0.0) {
+                let id = instances.and_then(|ids| ids.get(i));
+                let pixel = FlowPixel {
+                    pred: f.pred[i],
+                    truth: f.truth[i],
+                    depth: f.depth[i],
+                    pred_depth: f.pred_depth.get(i).copied(),
+                    user: id.is_some_and(|&id| id != 0),
+                    class: id.and_then(|id| clip.classes.get(id).copied()),
+                };
+                self.breakdown.flow(i, &pixel)?;
+            }
+            if f.instance.len() == f.truth.len() {
+                let foreground: Vec<bool> = f.instance.iter().map(|&id| id != 0).collect();
+                let kinds = three_way_epe(&f.pred, &f.truth, &foreground, Some(&frame(f)), AV2_DYNAMIC_MPS)?;
                 let values = [kinds.foreground_dynamic, kinds.foreground_static, kinds.background_static];
                 self.three_way.iter_mut().zip(values).for_each(|(mean, value)| mean.add(value));
             }
@@ -206,7 +260,7 @@ impl Tally {
 }
 
 impl StepFlow {
-    fn add(&mut self, truth: &TruthAt, pred: &[Flow]) {
+    fn add(&mut self, truth: &TruthAt, pred: &[Flow], pred_depth: Option<&[f32]>) {
         let (Some(flow), Some(depth)) = (&truth.flow, &truth.depth) else { return };
         if flow.len() != pred.len() {
             return;
@@ -214,7 +268,8 @@ impl StepFlow {
         self.pred.extend_from_slice(pred);
         self.truth.extend_from_slice(flow);
         self.depth.extend_from_slice(depth);
-        self.foreground.extend(truth.instance.iter().flatten().map(|&id| id != 0));
+        self.pred_depth.extend(pred_depth.into_iter().flatten());
+        self.instance.extend(truth.instance.iter().flatten());
     }
 }
 

@@ -31,7 +31,7 @@ const TIMED_STEPS: usize = 15;
 /// What came of a network on clips of so many timesteps.
 #[derive(Debug, Clone)]
 enum Found {
-    Figures(Figures),
+    Figures(Box<Figures>),
     /// The training ended; why.
     Ended(String),
 }
@@ -80,7 +80,7 @@ pub fn run(args: &Args, name: GridName, device: &Device, progress: bool) -> Resu
         for (row, found) in rows.iter().zip(&mut found).filter(|(row, _)| row.setting == *setting) {
             *found = Some(match &ended {
                 Some(why) => Found::Ended(why.clone()),
-                None => Found::Figures(score(&own, row.seen, cost, device)?),
+                None => Found::Figures(Box::new(score(&own, row.seen, cost, device)?)),
             });
         }
         info!("{}: {seconds:.0} s", setting.folder());

@@ -160,23 +160,14 @@ mod tests {
 
     #[test]
     fn tables_and_pictures_hold_every_row_and_no_nonsense() {
-        let errors = Validation {
-            depth_relative: None,
-            depth_rmse: None,
-            epe3d: None,
-            epe3d_moving: Some(3.25),
-            epe3d_moving_still: None,
-            psnr: Some(21.5),
-            opacity_surface: None,
-            opacity_sky: None,
-        };
+        let errors = Validation { epe3d_moving: Some(3.25), psnr: Some(21.5), ..Validation::default() };
         let figures = Figures { errors, parameters: 2_940_000, cost: None };
         let results: Vec<(Row, Found)> = GridName::Ablations
             .rows()
             .into_iter()
             .enumerate()
             .map(|(k, row)| {
-                (row, if k == 0 { Found::Ended("step 3: loss rgb".into()) } else { Found::Figures(figures) })
+                (row, if k == 0 { Found::Ended("step 3: loss rgb".into()) } else { Found::Figures(Box::new(figures)) })
             })
             .collect();
         let svg = picture(&results);
