@@ -21,6 +21,18 @@ pub enum ModelError {
         /// The name asked for.
         name: String,
     },
+    /// A network that cannot be grown into another.
+    #[error("cannot grow {field} from {from} to {to}: {fix}")]
+    Growth {
+        /// Name of the field as written in the file.
+        field: String,
+        /// The value it has.
+        from: String,
+        /// The value that was asked for.
+        to: String,
+        /// What would be accepted.
+        fix: String,
+    },
     /// A clip whose shapes or counts do not fit the network.
     #[error("clip input: {0}")]
     Input(String),

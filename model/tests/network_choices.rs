@@ -78,7 +78,8 @@ fn every_choice_runs_and_renders() {
         ModelConfig { disable_pos_embed: true, ..base.clone() },
         ModelConfig { color: ColorBase::Residual, depth_activation: DepthActivation::Log, ..base.clone() },
         ModelConfig { sky: SkyKind::Frequency64, affine: AffineKind::MatrixBias, ..base.clone() },
-        ModelConfig { mask_decoder: MaskDecoder::Paper, velocity_scale: 10.0, ..base },
+        ModelConfig { mask_decoder: MaskDecoder::Paper, velocity_scale: 10.0, ..base.clone() },
+        ModelConfig { upsampler_widths: vec![12], ..base },
     ];
     for config in configs {
         let storm = Storm::untrained(&config, 5, &Device::Cpu).unwrap();

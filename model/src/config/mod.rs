@@ -17,7 +17,7 @@ pub use validate::{MAX_CAMERAS, MAX_TIMESTEPS};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelConfig {
-    /// Patch side, pixels; a power of two (the upsampler doubles once per factor of two).
+    /// Patch side, pixels; a power of two (the upsampler doubles up to once per factor of two).
     pub patch_size: usize,
     /// Token width.
     pub embed_dim: usize,
@@ -55,7 +55,8 @@ pub struct ModelConfig {
     pub velocity_bases: VelocityBases,
     /// Which mask decoder.
     pub mask_decoder: MaskDecoder,
-    /// Channels after each doubling of the upsampler; one entry per factor of two in `patch_size`.
+    /// Channels after each doubling of the upsampler; at most one entry per factor of two in `patch_size`. With fewer, motion is
+    /// as much coarser than the image: 3 entries with patches of 16 give every 2 x 2 pixels one motion.
     pub upsampler_widths: Vec<usize>,
     /// Hidden width of the motion key MLP (unused by the paper's linear keys).
     pub key_hidden: usize,
@@ -142,6 +143,11 @@ impl ModelConfig {
             VelocityKind::One => 3,
             VelocityKind::ForwardBackward => 6,
         }
+    }
+
+    /// Side of the block of pixels that share one motion: what the upsampler's doublings leave of a patch.
+    pub fn motion_copies(&self) -> usize {
+        self.patch_size.checked_shr(self.upsampler_widths.len() as u32).unwrap_or(0).max(1)
     }
 
     /// Channels of the upsampled image features.

@@ -36,14 +36,15 @@ fn unknown_names_and_fields_are_refused() {
 #[test]
 fn every_bad_value_is_named() {
     type Spoil = fn(&mut ModelConfig);
-    let cases: [(&str, Spoil); 16] = [
+    let cases: [(&str, Spoil); 17] = [
         ("patch_size", |c| c.patch_size = 12),
         ("num_heads", |c| c.num_heads = 7),
         ("image_width", |c| c.image_width = 100),
         ("sweep_after_block", |c| c.sweep_after_block = c.depth),
         ("num_cams", |c| c.num_cams = 7),
         ("depth", |c| c.depth = 0),
-        ("upsampler_widths", |c| c.upsampler_widths = vec![8]),
+        ("upsampler_widths", |c| c.upsampler_widths = vec![]),
+        ("upsampler_widths", |c| c.upsampler_widths = vec![8; 4]),
         ("tau", |c| c.tau = 0.0),
         ("tau", |c| c.tau = f64::NAN),
         ("far", |c| c.far = c.near),

@@ -81,11 +81,11 @@ impl ModelConfig {
         in_range("key_hidden", self.key_hidden, 1, MAX_WIDTH)?;
         in_range("basis_hidden", self.basis_hidden, 1, MAX_WIDTH)?;
         let stages = self.patch_size.trailing_zeros() as usize;
-        if self.upsampler_widths.len() != stages {
+        if !(1..=stages).contains(&self.upsampler_widths.len()) {
             return Err(ModelError::Config {
                 field: "upsampler_widths",
                 value: format!("{:?}", self.upsampler_widths),
-                fix: format!("use {stages} widths: patch_size {} is doubled back {stages} times", self.patch_size),
+                fix: format!("use 1 to {stages} widths: patch_size {} is doubled back {stages} times", self.patch_size),
             });
         }
         self.upsampler_widths.iter().try_for_each(|&width| in_range("upsampler_widths", width, 1, MAX_WIDTH))

@@ -22,6 +22,7 @@ use candle_core::{DType, Device, Tensor};
 pub use output::ClipOutput;
 pub(crate) use params::NORM_EPS;
 use params::Params;
+pub(crate) use resample::resample;
 pub use reuse::Kept;
 pub use shortcuts::{MAX_KV_POOL, MAX_MERGE, Shortcuts};
 pub use stages::Stages;

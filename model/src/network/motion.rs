@@ -7,6 +7,7 @@ use super::stages::Stages;
 use super::upsample::{Prepared, Upsampler};
 use crate::config::{MaskDecoder, ModelConfig, VelocityBases, VelocityKind, spread_bases};
 use crate::error::ModelError;
+use crate::kernels::arrange::Nesting;
 use crate::ops::{Activation, Linear, Step, chain, linear, softmax, unnest};
 
 /// Velocities of every pixel and how they came about.
@@ -102,8 +103,8 @@ impl MotionHead {
         stages: &mut Stages,
     ) -> Result<Motion, ModelError> {
         let [b, t, v, h, w] = dims;
-        let levels = config.upsampler_widths.len();
-        let grid = (h >> levels, w >> levels);
+        let grid = (h / config.patch_size, w / config.patch_size);
+        let nesting = Nesting { grid, levels: config.upsampler_widths.len(), copies: config.motion_copies() };
         let pictures = image.reshape((b * t * v, grid.0 * grid.1, config.embed_dim))?;
         let mixture = motion.map(|tokens| self.mixture(tokens, config)).transpose()?;
         if let Some((queries, bases)) = &mixture {
@@ -122,12 +123,12 @@ impl MotionHead {
             let velocity = match &mixture {
                 Some((_, bases)) => {
                     let velocity = product(&decoded, bases.get(window)?.t()?.contiguous()?)?;
-                    all_weights.push(unnest(&decoded, grid, levels)?);
+                    all_weights.push(unnest(&decoded, nesting)?);
                     velocity
                 }
                 None => (self.bases[0].forward(&decoded)? * config.velocity_scale)?,
             };
-            all_velocities.push(unnest(&velocity, grid, levels)?);
+            all_velocities.push(unnest(&velocity, nesting)?);
         }
         let velocity = Tensor::cat(&all_velocities, 0)?.reshape((b, t, v, h, w, config.velocity_channels()))?;
         let weights = match all_weights.first() {
@@ -160,7 +161,8 @@ impl MotionHead {
             let keys = self.keys.forward(&features)?;
             if stages.wants("motion_keys") {
                 let levels = upsampler.steps().count();
-                stages.keep("motion_keys", &unnest(&keys, grid, levels)?.get(0)?);
+                let nesting = Nesting { grid, levels, copies: 1 };
+                stages.keep("motion_keys", &unnest(&keys, nesting)?.get(0)?);
             }
             return Ok(match queries {
                 Some(queries) => softmax(&product(&keys, queries)?, tau)?,

@@ -10,6 +10,7 @@ use super::params::{Arranged, Norm, Params};
 use super::stages::Stages;
 use crate::config::ModelConfig;
 use crate::error::ModelError;
+use crate::kernels::arrange::Nesting;
 use crate::ops::{Activation, Linear, Step, gelu, linear, unnest};
 use crate::weights::names::upsampler_norm;
 
@@ -89,7 +90,7 @@ impl Prepared<'_> {
 fn keep(stages: &mut Stages, layer: usize, x: &Tensor, grid: (usize, usize), levels: usize) -> Result<()> {
     let name = format!("upscaling_{layer}");
     if stages.wants(&name) {
-        stages.keep(&name, &unnest(x, grid, levels)?.get(0)?);
+        stages.keep(&name, &unnest(x, Nesting { grid, levels, copies: 1 })?.get(0)?);
     }
     Ok(())
 }
@@ -121,7 +122,7 @@ mod tests {
         let upsampler = Upsampler(vec![layer(&w1, c1), layer(&w2, c2)]);
         let prepared = upsampler.prepare().unwrap();
         let ours = prepared.forward(&x, (rows, cols), &mut Stages::none()).unwrap();
-        let ours = unnest(&ours, (rows, cols), 2).unwrap().get(0).unwrap();
+        let ours = unnest(&ours, Nesting { grid: (rows, cols), levels: 2, copies: 1 }).unwrap().get(0).unwrap();
         let chw = x.reshape((1, rows, cols, d)).unwrap().permute((0, 3, 1, 2)).unwrap().contiguous().unwrap();
         let y = chw.conv_transpose2d(&w1, 0, 0, 2, 1).unwrap().gelu_erf().unwrap();
         let y = y.conv_transpose2d(&w2, 0, 0, 2, 1).unwrap().gelu_erf().unwrap();

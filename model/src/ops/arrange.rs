@@ -2,7 +2,9 @@
 
 use candle_core::{Result, Tensor};
 
+use super::graph::{Backward, node};
 use super::process::zeros;
+use crate::kernels::arrange::Nesting;
 use crate::kernels::gaussians::{Input, Meaning, Output};
 use crate::kernels::tensors::{covered, tracked, with_all, with_values};
 use crate::kernels::{self, Isa};
@@ -35,34 +37,77 @@ pub(crate) fn patches(image: &Tensor, planes: &Tensor, p: usize) -> Result<Tenso
     Tensor::from_vec(out, shape, image.device())
 }
 
-/// `(n rows cols 4^levels, c)`, each of the `n` pictures in nested order, to `(n, rows 2^levels, cols 2^levels, c)`.
-pub(crate) fn unnest(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<Tensor> {
+/// `(n rows cols 4^levels, c)`, each of the `n` images in nested order, to
+/// `(n, rows 2^levels copies, cols 2^levels copies, c)`.
+pub(crate) fn unnest(x: &Tensor, nesting: Nesting) -> Result<Tensor> {
     let (all, c) = x.dims2()?;
-    let side = 1 << levels;
-    let pictures = all / (grid.0 * grid.1 * side * side).max(1);
-    let result = (pictures, grid.0 * side, grid.1 * side, c);
-    if ready([x]) && pictures * grid.0 * grid.1 * side * side == all {
-        let mut out = zeros(x.elem_count());
-        with_values(x, |x| {
-            kernels::arrange::unnest(x, c, grid, levels, &mut out);
+    let Nesting { grid, levels, copies } = nesting;
+    let (height, width) = (grid.0 << levels, grid.1 << levels);
+    let pixels = height * width;
+    if pixels == 0 || copies == 0 || !all.is_multiple_of(pixels) {
+        candle_core::bail!("{all} nested pixels do not fill images of {nesting:?}");
+    }
+    let images = all / pixels;
+    if !covered([x]) || all == 0 {
+        let x = in_rows(x, grid, levels)?;
+        return match copies {
+            1 => Ok(x),
+            _ => x
+                .reshape((images, height, 1, width, 1, c))?
+                .broadcast_as((images, height, copies, width, copies, c))?
+                .contiguous()?
+                .reshape((images, height * copies, width * copies, c)),
+        };
+    }
+    let mut out = zeros(x.elem_count() * copies * copies);
+    with_values(x, |x| {
+        kernels::arrange::unnest(x, c, nesting, &mut out);
+        Ok(())
+    })?;
+    let backward = UnnestBackward { nesting, all, c };
+    node(out, (images, height * copies, width * copies, c), &[Some(x)], backward)
+}
+
+struct UnnestBackward {
+    nesting: Nesting,
+    all: usize,
+    c: usize,
+}
+
+impl Backward for UnnestBackward {
+    fn name(&self) -> &'static str {
+        "unnest"
+    }
+
+    fn gradients(&self, _: &Tensor, grad: &Tensor) -> Result<Vec<Option<Tensor>>> {
+        let mut out = zeros(self.all * self.c);
+        with_values(grad, |grad| {
+            kernels::arrange::nest(grad, self.c, self.nesting, &mut out);
             Ok(())
         })?;
-        return Tensor::from_vec(out, result, x.device());
+        Ok(vec![Some(Tensor::from_vec(out, (self.all, self.c), grad.device())?)])
     }
+}
+
+/// [`unnest`] without copies, by candle's own operations.
+fn in_rows(x: &Tensor, grid: (usize, usize), levels: usize) -> Result<Tensor> {
+    let (all, c) = x.dims2()?;
+    let side = 1 << levels;
+    let images = all / (grid.0 * grid.1 * side * side).max(1);
     // candle goes through no more than 8 axes that do not lie one in the other: more levels are taken one by one.
     if levels > 3 {
         let ((rows, cols), inner) = (grid, 1 << (2 * (levels - 1)));
-        let x = x.reshape((pictures, rows, cols, 2, 2, inner * c))?.permute((0, 1, 3, 2, 4, 5))?.contiguous()?;
-        return unnest(&x.reshape((all, c))?, (2 * rows, 2 * cols), levels - 1);
+        let x = x.reshape((images, rows, cols, 2, 2, inner * c))?.permute((0, 1, 3, 2, 4, 5))?.contiguous()?;
+        return in_rows(&x.reshape((all, c))?, (2 * rows, 2 * cols), levels - 1);
     }
-    let mut shape = vec![pictures, grid.0, grid.1];
+    let mut shape = vec![images, grid.0, grid.1];
     shape.extend(std::iter::repeat_n(2, 2 * levels));
     shape.push(c);
-    // Axes: picture, row, col, then (row bit, col bit) per level, coarse to fine.
+    // Axes: image, row, col, then (row bit, col bit) per level, coarse to fine.
     let rows = std::iter::once(1).chain((0..levels).map(|k| 3 + 2 * k));
     let cols = std::iter::once(2).chain((0..levels).map(|k| 4 + 2 * k));
     let axes: Vec<usize> = std::iter::once(0).chain(rows).chain(cols).chain(std::iter::once(3 + 2 * levels)).collect();
-    x.reshape(shape)?.permute(axes)?.contiguous()?.reshape(result)
+    x.reshape(shape)?.permute(axes)?.contiguous()?.reshape((images, grid.0 * side, grid.1 * side, c))
 }
 
 /// Means, scales, quaternions, opacities, colours and depths of the Gaussian head's raw numbers, each `(views h w, channels)`

@@ -2,6 +2,7 @@
 //! of the plain versions in f64.
 
 use super::*;
+use crate::kernels::arrange::Nesting;
 use crate::kernels::tests::noise as noise_values;
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Var};
@@ -262,16 +263,23 @@ fn any_layout_and_shared_inputs() {
 }
 
 #[test]
-fn pictures_of_any_number_of_levels_are_put_in_order_and_have_a_gradient() {
-    for levels in 1..=5 {
+fn nested_pixels_of_any_number_of_levels_and_copies_have_a_gradient() {
+    for (levels, copies) in (1..=5).flat_map(|levels| [1, 2, 4].map(|copies| (levels, copies))) {
+        let nesting = Nesting { grid: (3, 2), levels, copies };
         let x = noise(levels as u64, &[(2 * 3 * 2) << (2 * levels), 2], 1.0);
-        let var = Var::from_tensor(&x).unwrap();
-        let ordered = unnest(var.as_tensor(), (3, 2), levels).unwrap();
-        assert_eq!(flat(&ordered), flat(&unnest(&x, (3, 2), levels).unwrap()), "{levels} levels: as the kernel");
-        let grads = ordered.sqr().unwrap().sum_all().unwrap().backward().unwrap();
-        let twice: Vec<f64> = flat(&x).iter().map(|x| 2.0 * x).collect();
-        assert_eq!(gradient(&grads, &var), twice, "{levels} levels");
+        let rows = unnest(&x, nesting).unwrap();
+        // candle's own operations take what is not f32.
+        let plain = |x: &Tensor| unnest(&x.to_dtype(DType::F64)?, nesting);
+        assert_eq!(rows.dims(), [2, (3 << levels) * copies, (2 << levels) * copies, 2]);
+        assert_eq!(flat(&rows), flat(&plain(&x).unwrap()), "{levels} levels, {copies} copies: as candle's operations");
+        let of = |f: &dyn Fn(&Tensor) -> Result<Tensor>| {
+            let var = Var::from_tensor(&x).unwrap();
+            gradient(&loss(&f(var.as_tensor()).unwrap()).backward().unwrap(), &var)
+        };
+        let (got, want) = (of(&|x| unnest(x, nesting)), of(&plain));
+        assert!(got.iter().zip(&want).all(|(a, b)| (a - b).abs() < 1e-5), "{levels} levels, {copies} copies");
     }
+    assert!(unnest(&noise(1, &[5, 2], 1.0), Nesting { grid: (1, 1), levels: 1, copies: 1 }).is_err());
 }
 
 #[test]

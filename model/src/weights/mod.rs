@@ -2,6 +2,7 @@
 
 mod check;
 mod error;
+mod grow;
 mod infer;
 mod init;
 pub(crate) mod names;
@@ -16,6 +17,7 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 pub use check::check_shapes;
 pub use error::{Mismatch, WeightsError};
+pub use grow::grow;
 pub use infer::infer_config;
 pub use init::untrained;
 pub use names::{Init, TensorSpec, tensor_specs};

@@ -49,13 +49,18 @@ pub struct Args {
     /// Save and end at this step of the run; --resume goes on there.
     #[arg(long)]
     stop_at: Option<u64>,
-    /// Architecture of a new network.
-    #[arg(long, default_value = "tiny", conflicts_with_all = ["weights", "resume"])]
-    preset: String,
+    /// Architecture of a new network, or of the one that --grow-from makes [default: tiny; with --grow-from: that of its weights].
+    #[arg(long, conflicts_with_all = ["weights", "resume"])]
+    preset: Option<String>,
     /// Start from these weights, or from the ones that ship (`shipped`), with a fresh optimiser. Several, comma-separated: from their
     /// mean (with --minutes 0 it is only written).
     #[arg(long, conflicts_with = "resume", value_delimiter = ',')]
     weights: Vec<PathBuf>,
+    /// Start from these weights (or `shipped`), grown into the larger network that --preset and --network describe: larger patches
+    /// of larger images, more patches, wider or more blocks, with the results of the small one (with --minutes 0 it is
+    /// only written).
+    #[arg(long, value_name = "WEIGHTS", conflicts_with_all = ["weights", "resume", "grid"])]
+    grow_from: Option<PathBuf>,
     /// Go on exactly where this checkpoint was written; its options hold, only --out, --minutes and the reports differ.
     #[arg(long)]
     resume: Option<PathBuf>,
@@ -121,6 +126,13 @@ pub struct Args {
     /// Where to compute: cpu, cuda or metal (as built).
     #[arg(long, default_value = "cpu")]
     device: String,
+}
+
+impl Args {
+    /// The architecture of a new network.
+    fn preset_name(&self) -> &str {
+        self.preset.as_deref().unwrap_or("tiny")
+    }
 }
 
 /// Trains.
@@ -216,10 +228,15 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
     if let Some(path) = &args.resume {
         return Ok(Trainer::resume(path, device)?);
     }
-    let Beginning { config, weights, history } = if args.weights.is_empty() {
-        let config = ModelConfig::preset(&args.preset).map_err(|e| UsageError(e.to_string()))?;
-        let config = ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config };
-        args.variant.make(&config, args.seed, &args.preset)?
+    let preset = |name: &str| {
+        let config = ModelConfig::preset(name).map_err(|e| UsageError(e.to_string()))?;
+        Ok::<_, UsageError>(ModelConfig { num_cams: config.num_cams.max(args.cameras), ..config })
+    };
+    let Beginning { config, weights, history } = if let Some(path) = &args.grow_from {
+        let into = args.preset.as_deref().map(preset).transpose()?;
+        args.variant.grow(trained(path)?, into, args.seed)?
+    } else if args.weights.is_empty() {
+        args.variant.make(&preset(args.preset_name())?, args.seed, args.preset_name())?
     } else {
         args.variant.change(mean::mean(&args.weights, &trained)?, args.seed)?
     };
@@ -232,7 +249,7 @@ fn start(args: &Args, device: &Device) -> Result<Trainer> {
         prior_sec: args.prior_sec,
         ..ClipOptions::default()
     };
-    let from = match (args.recorded.alone(), args.weights.is_empty()) {
+    let from = match (args.recorded.alone(), args.weights.is_empty() && args.grow_from.is_none()) {
         (true, _) => Start::Recordings,
         (false, false) => Start::Weights,
         (false, true) => Start::New,

@@ -7,9 +7,9 @@ use candle_core::Device;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use storm_model::ModelConfig;
 use storm_model::train::TrainOptions;
-use storm_model::weights::{Tensors, untrained};
+use storm_model::weights::{Tensors, grow, untrained};
+use storm_model::{ModelConfig, ModelError};
 
 use crate::cmd::UsageError;
 
@@ -102,6 +102,19 @@ impl VariantArgs {
         let anew = if parts.is_empty() { "nothing".to_owned() } else { parts };
         let history =
             format!("{}; changed to {}, where {anew} began anew (seed {seed})", from.history, config.describe());
+        Ok(Beginning { config, weights, history })
+    }
+
+    /// A trained network grown into a larger one: `into`, or its own configuration, changed.
+    pub fn grow(&self, from: Beginning, into: Option<ModelConfig>, seed: u64) -> Result<Beginning> {
+        let mut into = into.unwrap_or_else(|| from.config.clone());
+        into.num_cams = into.num_cams.max(from.config.num_cams);
+        let config = self.configure(&into)?;
+        let weights = grow(&from.config, &from.weights, &config, seed).map_err(|e| match e {
+            ModelError::Growth { .. } => UsageError(format!("--grow-from: {e}")).into(),
+            e => anyhow::Error::from(e),
+        })?;
+        let history = format!("{}; grown to {} (seed {seed})", from.history, config.describe());
         Ok(Beginning { config, weights, history })
     }
 
@@ -241,5 +254,25 @@ mod tests {
         }
         assert!(kept > 40 && kept < fewer.weights.len(), "{kept} of {}", fewer.weights.len());
         assert!(fewer.history.contains("motion_token"), "{}", fewer.history);
+    }
+
+    #[test]
+    fn a_grown_network_is_the_larger_one_and_says_where_it_came_from() {
+        let (config, weights) = storm_model::weights::shipped(&Device::Cpu).unwrap();
+        let from = || Beginning { config: config.clone(), weights: weights.clone(), history: "shipped".into() };
+        let args = |keys: &[&str]| VariantArgs {
+            network: keys.iter().map(|k| (*k).to_owned()).collect(),
+            ..VariantArgs::default()
+        };
+        let keys = ["patch_size=16", "image_height=160", "image_width=240", "depth=5"];
+        let grown = args(&keys).grow(from(), None, 1).unwrap();
+        assert_eq!((grown.config.patch_size, grown.config.grid(), grown.config.depth), (16, (10, 15), 5));
+        assert_eq!(grown.weights["pos_embed"].dims(), [1, 150, 192]);
+        assert!(grown.history.starts_with("shipped; grown to patch 16"), "{}", grown.history);
+        let error = args(&["depth=3"]).grow(from(), None, 1).err().unwrap();
+        assert!(error.downcast_ref::<UsageError>().is_some(), "{error}");
+        assert!(error.to_string().contains("cannot grow depth from 4 to 3"), "{error}");
+        let b8 = ModelConfig::preset("b8").unwrap();
+        assert!(args(&[]).grow(from(), Some(b8), 1).is_err());
     }
 }

@@ -36,7 +36,7 @@ fn columns(name: GridName) -> Vec<Column> {
 fn what(args: &Args) -> String {
     let weights: Vec<String> = args.weights.iter().map(|w| w.display().to_string()).collect();
     let from = match weights.is_empty() {
-        true => format!("new {} networks", args.preset),
+        true => format!("new {} networks", args.preset_name()),
         false => format!("from {} weights", weights.join(" and ")),
     };
     format!(
