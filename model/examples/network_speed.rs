@@ -1,6 +1,6 @@
 //! Time of one forward pass of a preset with random weights, against the machine's multiply-add peak.
 //!
-//! `cargo run --release -p storm-model --example network_speed [shipped|tiny|small|b8][@WIDTHxHEIGHT] [runs] [setting]...`,
+//! `cargo run --release -p storm-model --example network_speed [shipped|tiny|base|b8][@WIDTHxHEIGHT] [runs] [setting]...`,
 //! where a setting is parts joined by `+`: `int8`, `pool2`, `int16+merge0.3`, `keep0.7`, `newest`. Settings are timed in turn, round
 //! by round, and their results compared with those of f32. Prints wall and processor time per
 //! forward pass and per conversion to plain numbers, medians and least, the counted products and the time they would take

@@ -16,7 +16,7 @@ pub enum ModelError {
         fix: String,
     },
     /// A preset name that is not known.
-    #[error("unknown model preset '{name}'; known: tiny, small, b8, l8, xl8, h8, b16, l16, xl16, h16")]
+    #[error("unknown model preset '{name}'; known: tiny, base, b8, l8, xl8, h8, b16, l16, xl16, h16")]
     UnknownPreset {
         /// The name asked for.
         name: String,

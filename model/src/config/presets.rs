@@ -50,16 +50,18 @@ impl Default for ModelConfig {
 }
 
 impl ModelConfig {
-    /// A named size: the authors' `b8 l8 xl8 h8 b16 l16 xl16 h16` (also written `STORM-B/8`), or `tiny` and `small`.
+    /// A named size: the authors' `b8 l8 xl8 h8 b16 l16 xl16 h16` (also written `STORM-B/8`), or `tiny` and `base`.
     ///
     /// The authors' sizes come with the authors' choices, so their weights give their numbers. `tiny` (a window of
-    /// 3 cameras x 4 timesteps of 64 x 96 pixels in about 10 GFLOP) and `small` use what learns fastest on a small budget.
+    /// 3 cameras x 4 timesteps of 64 x 96 pixels in about 10 GFLOP) and `base` use what learns fastest on a small budget. `base` takes
+    /// the authors' 160 x 240 pixels with `tiny`'s widths in patches of 16, one motion for 2 x 2 pixels, so that weights of
+    /// `tiny` can be grown into it (`weights::grow`).
     pub fn preset(name: &str) -> Result<Self, ModelError> {
         let plain: String = name.to_ascii_lowercase().chars().filter(|c| c.is_ascii_alphanumeric()).collect();
         let plain = plain.strip_prefix("storm").unwrap_or(&plain);
         match plain {
             "tiny" => return Ok(Self::tiny()),
-            "small" => return Ok(Self::small()),
+            "base" => return Ok(Self::base()),
             _ => {}
         }
         let unknown = || ModelError::UnknownPreset { name: name.to_owned() };
@@ -94,18 +96,8 @@ impl ModelConfig {
         }
     }
 
-    fn small() -> Self {
-        Self {
-            embed_dim: 384,
-            depth: 8,
-            num_heads: 6,
-            image_height: 96,
-            image_width: 144,
-            upsampler_widths: vec![192, 128, 64],
-            key_hidden: 128,
-            basis_hidden: 128,
-            ..Self::small_budget()
-        }
+    fn base() -> Self {
+        Self { patch_size: 16, image_height: 160, image_width: 240, ..Self::tiny() }
     }
 
     /// Choices that let a network of a few million parameters start from a useful point.

@@ -3,7 +3,7 @@ use crate::error::ModelError;
 
 #[test]
 fn presets_are_valid_and_read_back_the_same() {
-    for name in ["tiny", "small", "b8", "l8", "xl8", "h8", "b16", "l16", "xl16", "h16", "STORM-B/8"] {
+    for name in ["tiny", "base", "b8", "l8", "xl8", "h8", "b16", "l16", "xl16", "h16", "STORM-B/8"] {
         let authors = ModelConfig::preset(name).unwrap();
         for config in [authors.clone(), authors.with_paper_choices()] {
             config.validate().unwrap();

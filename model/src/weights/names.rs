@@ -218,7 +218,7 @@ mod tests {
 
     #[test]
     fn names_are_unique_and_sizes_are_positive() {
-        for name in ["tiny", "small", "b8", "xl16"] {
+        for name in ["tiny", "base", "b8", "xl16"] {
             for config in [ModelConfig::preset(name).unwrap(), ModelConfig::preset(name).unwrap().with_paper_choices()]
             {
                 let specs = tensor_specs(&config);

@@ -85,7 +85,7 @@ section! {
     pub struct ModelConfigSection {
         /// Weights file (.safetensors, .pth, .pt); empty: the weights that ship (preset `tiny`), seeded random ones for other presets; `untrained`: seeded random ones.
         weights: String = String::new(),
-        /// Architecture when there is no weights file: tiny, small, b8, l8, xl8, h8, b16, l16, h16.
+        /// Architecture when there is no weights file: tiny, base, b8, l8, xl8, h8, b16, l16, h16.
         preset: String = "tiny".into(),
         /// Seed of the random weights used without a weights file.
         untrained_seed: u64 = 1,

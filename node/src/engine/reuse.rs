@@ -20,7 +20,7 @@ use crate::source::Frame;
 use crate::sync::clock::seconds_between;
 use crate::window::Window;
 
-/// Most that is kept at once, bytes: ten phases of `tiny`'s size, a few of `small`'s.
+/// Most that is kept at once, bytes: ten phases of `tiny`'s size.
 const MOST_BYTES: usize = 256 << 20;
 
 /// What one step left.

@@ -50,7 +50,7 @@ pub struct Args {
     /// Write the figures as JSON.
     #[arg(long)]
     json: Option<PathBuf>,
-    /// Networks, comma-separated; b8 takes minutes a row, and is measured at few settings [default: tiny,small; with --quick: tiny].
+    /// Networks, comma-separated; b8 takes minutes a row, and is measured at few settings [default: tiny,base; with --quick: tiny].
     #[arg(long, value_delimiter = ',')]
     models: Vec<String>,
     /// Another row, `NAME: KEY=VALUE, KEY=VALUE` with any configuration keys; may be given again.
@@ -107,7 +107,7 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let models: Vec<String> = match (args.models.is_empty(), args.quick) {
         (false, _) => args.models.clone(),
         (true, true) => vec!["tiny".into()],
-        (true, false) => ["tiny", "small"].map(String::from).to_vec(),
+        (true, false) => ["tiny", "base"].map(String::from).to_vec(),
     };
     let rows = |all: Vec<Named>, quick: usize| -> Vec<Named> {
         let first = if args.quick { quick } else { all.len() };
