@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::error::BagError;
 use super::mcap::McapStream;
 use super::sqlite::SqliteStream;
-use super::unpack::{is_compressed, unpack_message};
+use super::unpack::{is_zstd, unpack_message};
 use super::{BagInner, FileMessage, RawMessage, Storage};
 
 enum Stream {
@@ -128,7 +128,7 @@ impl Iterator for Messages {
         let Open { file, stream, head } = self.open.swap_remove(earliest);
         self.pull(file, stream);
         let topic = self.bag.files.get(file).and_then(|f| f.topic_of_local.get(head.topic)).copied()?;
-        let data = if is_compressed(&head.data) {
+        let data = if is_zstd(&head.data) {
             match unpack_message(&head.data) {
                 Ok(data) => data,
                 Err(why) => {

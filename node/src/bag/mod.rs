@@ -33,6 +33,7 @@ use problems::Problems;
 use sqlite::SqliteIndex;
 use topics::{FileTopic, FileTopics};
 use unpack::FileKind;
+pub(crate) use unpack::{is_zstd, read_bounded, unpack_zstd};
 
 /// Serializations that an error lists.
 const MOST_NAMED: usize = 8;

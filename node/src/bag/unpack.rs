@@ -99,7 +99,7 @@ pub(crate) fn unpack_file(path: &Path) -> Result<(NamedTempFile, Option<String>)
 }
 
 /// True when a message is a zstd frame instead of CDR (rosbag2's `compression_mode: message`).
-pub(crate) fn is_compressed(message: &[u8]) -> bool {
+pub(crate) fn is_zstd(message: &[u8]) -> bool {
     message.starts_with(&ZSTD_MAGIC)
 }
 
@@ -145,7 +145,7 @@ mod tests {
     fn messages_round_trip_and_bombs_are_refused() {
         let data: Vec<u8> = (0..100_000u32).map(|i| (i % 251) as u8).collect();
         let packed = zstd::bulk::compress(&data, 3).unwrap();
-        assert!(is_compressed(&packed) && !is_compressed(&[0, 1, 0, 0, 5]));
+        assert!(is_zstd(&packed) && !is_zstd(&[0, 1, 0, 0, 5]));
         assert_eq!(unpack_message(&packed).unwrap(), data);
         assert!(unpack_message(&packed[..packed.len() / 2]).is_err());
         let (part, why) = unpack_zstd(&packed, 1000);

@@ -12,12 +12,12 @@ pub struct Pattern {
 }
 
 impl Pattern {
-    /// Pattern and bits of an encoding such as `bayer_rggb8`.
-    pub fn of_encoding(encoding: &str) -> Option<(Self, u32)> {
+    /// Pattern and bytes per sample of an encoding such as `bayer_rggb8`.
+    pub fn of_encoding(encoding: &str) -> Option<(Self, usize)> {
         let rest = encoding.strip_prefix("bayer_")?;
-        let (order, bits) = match rest.strip_suffix("16") {
-            Some(order) => (order, 16),
-            None => (rest.strip_suffix('8')?, 8),
+        let (order, bytes) = match rest.strip_suffix("16") {
+            Some(order) => (order, 2),
+            None => (rest.strip_suffix('8')?, 1),
         };
         let (red_row, red_col) = match order {
             "rggb" => (0, 0),
@@ -26,7 +26,7 @@ impl Pattern {
             "bggr" => (1, 1),
             _ => return None,
         };
-        Some((Self { red_col, red_row }, bits))
+        Some((Self { red_col, red_row }, bytes))
     }
 }
 
@@ -100,8 +100,8 @@ mod tests {
     #[test]
     fn names_put_their_first_letters_at_the_top_left() {
         for (name, first_row) in [("rggb", [0, 1]), ("grbg", [1, 0]), ("gbrg", [1, 2]), ("bggr", [2, 1])] {
-            let (pattern, bits) = Pattern::of_encoding(&format!("bayer_{name}16")).unwrap();
-            assert_eq!(bits, 16);
+            let (pattern, bytes) = Pattern::of_encoding(&format!("bayer_{name}16")).unwrap();
+            assert_eq!(bytes, 2);
             let samples = mosaic_of(pattern, 2, 2, |_, _| [0, 1, 2]);
             assert_eq!(samples[..2], first_row, "{name}");
         }

@@ -1,25 +1,33 @@
-//! JPEG and PNG messages to 8-bit RGB.
+//! CompressedImage messages to 8-bit RGB.
 
 use std::io::Cursor;
 
 use image::{DynamicImage, ImageFormat, ImageReader, Limits};
 
-use super::RgbPicture;
+use super::bayer::{self, Mosaic, Pattern};
+use super::encoding::{Encoding, Shows};
 use super::error::DecodeError;
+use super::format::{Codec, Format};
+use super::mjpeg::with_huffman_tables;
+use super::packed::unpack_image;
 use super::rows::MAX_SIDE;
+use super::{RgbPicture, image_to_rgb};
 use crate::msg::CompressedImage;
 use crate::pipeline::guard::caught;
 
+/// What [`compressed_to_rgb`] reads, as errors list it.
+pub const COMPRESSED_FORMATS: &str = "jpeg (motion JPEG too), png, tiff, zstd; of a colour, grey or Bayer image";
 /// Largest picture: a few hundred bytes can claim more, and take seconds to unpack.
 const MAX_PIXELS: usize = 100_000_000;
 /// Memory a decoder may take: the largest picture with its working buffers.
 const MAX_DECODER_BYTES: u64 = 1 << 30;
 
 /// A compressed picture as 8-bit RGB; grey becomes RGB, an alpha channel is dropped, 16-bit samples keep their upper part.
-/// The file itself says what it is; the `format` field only appears in errors.
+/// A file says itself what kind it is and in which order its colours lie; the `format` field says whether a grey one is a
+/// Bayer mosaic, which is interpolated.
 ///
 /// # Errors
-/// Neither JPEG nor PNG, a damaged file, or one that claims more than it may.
+/// A format that is not decoded here or does not show colour (depth), a damaged file, or one that claims more than it may.
 pub fn compressed_to_rgb(message: &CompressedImage) -> Result<RgbPicture, DecodeError> {
     compressed_of_size(message, None)
 }
@@ -33,24 +41,78 @@ pub fn compressed_of_size(
     message: &CompressedImage,
     expected: Option<(usize, usize)>,
 ) -> Result<RgbPicture, DecodeError> {
-    let wrong =
-        |why: String| DecodeError::Compressed { format: message.format.clone(), bytes: message.data.len(), why };
-    if message.format.contains("compressedDepth") {
-        return Err(wrong("compressedDepth is not a colour picture; use the colour topic".to_owned()));
+    let format = Format::parse(&message.format);
+    let refused =
+        || DecodeError::Encoding { found: message.format.clone(), wanted: "colour", accepted: COMPRESSED_FORMATS };
+    if format.shows() != Shows::Color {
+        return Err(refused());
     }
-    let format = match image::guess_format(&message.data) {
-        Ok(f @ (ImageFormat::Jpeg | ImageFormat::Png)) => f,
-        _ if message.data.is_empty() => return Err(wrong("it is empty".to_owned())),
-        _ => return Err(wrong("neither JPEG nor PNG; only these are accepted".to_owned())),
+    if format.codec == Codec::Zstd {
+        let raw = unpack_image(message)?;
+        check_size((raw.width as usize, raw.height as usize), expected)?;
+        return image_to_rgb(&raw);
+    }
+    let kind = match image::guess_format(&message.data) {
+        Ok(kind @ (ImageFormat::Jpeg | ImageFormat::Png | ImageFormat::Tiff)) => kind,
+        _ if format.codec == Codec::Other => return Err(refused()),
+        _ if message.data.is_empty() => return Err(damaged(message, "it is empty".to_owned())),
+        _ => return Err(damaged(message, "neither JPEG nor PNG nor TIFF; only these are accepted".to_owned())),
     };
-    let reader = || ImageReader::with_format(Cursor::new(&message.data), format);
+    let picture = decode_file(message, kind, expected)?;
+    Ok(match (Encoding::named(format.encoding), picture) {
+        (Some(Encoding::Bayer { pattern, .. }), DynamicImage::ImageLuma8(grey)) => {
+            let size = grey.dimensions();
+            demosaic(pattern, size, grey.into_raw().into_iter().map(u16::from).collect(), 0)
+        }
+        (Some(Encoding::Bayer { pattern, .. }), DynamicImage::ImageLuma16(grey)) => {
+            let size = grey.dimensions();
+            demosaic(pattern, size, grey.into_raw(), 8)
+        }
+        // A file of three colours has been demosaiced before it was written.
+        (_, picture) => {
+            let rgb = match picture {
+                DynamicImage::ImageRgb8(rgb) => rgb,
+                other => other.into_rgb8(),
+            };
+            RgbPicture { width: rgb.width() as usize, height: rgb.height() as usize, data: rgb.into_raw() }
+        }
+    })
+}
+
+fn demosaic(pattern: Pattern, (width, height): (u32, u32), samples: Vec<u16>, shift: u32) -> RgbPicture {
+    let (width, height) = (width as usize, height as usize);
+    let data = bayer::demosaic(&Mosaic { width, height, samples: &samples, pattern }, shift);
+    RgbPicture { width, height, data }
+}
+
+fn damaged(message: &CompressedImage, why: String) -> DecodeError {
+    DecodeError::Compressed { format: message.format.clone(), bytes: message.data.len(), why }
+}
+
+fn check_size((width, height): (usize, usize), expected: Option<(usize, usize)>) -> Result<(), DecodeError> {
+    match expected.filter(|want| *want != (width, height)) {
+        Some((want_width, want_height)) => Err(DecodeError::Size { width, height, want_width, want_height }),
+        None => Ok(()),
+    }
+}
+
+/// The picture of an image file, once its header was found to claim no more than it may.
+pub(super) fn decode_file(
+    message: &CompressedImage,
+    kind: ImageFormat,
+    expected: Option<(usize, usize)>,
+) -> Result<DynamicImage, DecodeError> {
+    let wrong = |why: String| damaged(message, why);
+    let data = match kind {
+        ImageFormat::Jpeg => with_huffman_tables(&message.data),
+        _ => message.data.as_slice().into(),
+    };
+    let reader = || ImageReader::with_format(Cursor::new(&*data), kind);
     // A decoder of others that panics on a hostile file says no more than that the file is damaged.
     let gave_up = |what: String| wrong(format!("the decoder gave up on it: {what}"));
     let header = caught(|| reader().into_dimensions()).map_err(gave_up)?;
     let (width, height) = header.map(|(w, h)| (w as usize, h as usize)).map_err(|e| wrong(e.to_string()))?;
-    if let Some((want_width, want_height)) = expected.filter(|want| *want != (width, height)) {
-        return Err(DecodeError::Size { width, height, want_width, want_height });
-    }
+    check_size((width, height), expected)?;
     if width.saturating_mul(height) > MAX_PIXELS {
         return Err(wrong(format!("it claims {width} x {height} pixels; at most {MAX_PIXELS} are accepted")));
     }
@@ -63,14 +125,7 @@ pub fn compressed_of_size(
         reader.limits(limits);
         reader.decode()
     });
-    let decoded = decoded.map_err(gave_up)?;
-    let picture = decoded.map_err(|e| wrong(e.to_string()))?;
-    let rgb = match picture {
-        DynamicImage::ImageRgb8(rgb) => rgb,
-        other => other.into_rgb8(),
-    };
-    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
-    Ok(RgbPicture { width, height, data: rgb.into_raw() })
+    decoded.map_err(gave_up)?.map_err(|e| wrong(e.to_string()))
 }
 
 #[cfg(test)]
@@ -100,6 +155,67 @@ mod tests {
     }
 
     #[test]
+    fn a_grey_file_is_a_mosaic_where_the_format_says_so() {
+        // Of RGGB the colour (200, 90, 30), in 8 bits and in 16.
+        let sample = |x: u32, y: u32| [[200u8, 90], [90, 30]][y as usize % 2][x as usize % 2];
+        let eight = GrayImage::from_fn(8, 6, |x, y| image::Luma([sample(x, y)]));
+        let sixteen = image::ImageBuffer::from_fn(8, 6, |x, y| image::Luma([u16::from(sample(x, y)) * 256 + 3]));
+        let files = [
+            encode(eight.clone(), ImageFormat::Png),
+            encode(eight.clone(), ImageFormat::Tiff),
+            encode(DynamicImage::ImageLuma16(sixteen), ImageFormat::Png),
+        ];
+        for mut m in files {
+            for format in ["bayer_rggb8; png compressed ", "bayer_rggb16; png compressed ", "bayer_rggb8"] {
+                m.format = format.to_owned();
+                let rgb = compressed_to_rgb(&m).unwrap().data;
+                assert!(rgb.chunks(3).all(|p| p == [200, 90, 30]), "{format}: {rgb:?}");
+            }
+            m.format = "mono8; png compressed ".to_owned();
+            let grey = compressed_to_rgb(&m).unwrap().data;
+            assert!(grey.chunks(3).all(|p| p[0] == p[1] && p[1] == p[2]), "{grey:?}");
+        }
+        let mut jpeg = encode(eight, ImageFormat::Jpeg);
+        jpeg.format = "bayer_rggb8; jpeg compressed ".to_owned();
+        let rgb = compressed_to_rgb(&jpeg).unwrap().data;
+        assert!(rgb.chunks(3).all(|p| p[0] > p[1] && p[1] > p[2]), "{rgb:?}");
+        // Demosaiced by the driver already.
+        let mut colour = encode(RgbImage::from_pixel(8, 6, image::Rgb([1, 2, 3])), ImageFormat::Png);
+        colour.format = "bayer_rggb8; png compressed bgr8".to_owned();
+        assert_eq!(compressed_to_rgb(&colour).unwrap().data, [1, 2, 3].repeat(48));
+    }
+
+    #[test]
+    fn tiff_in_8_and_16_bits() {
+        let rgb = RgbImage::from_fn(9, 5, |x, y| image::Rgb([x as u8 * 10, y as u8 * 20, 77]));
+        let mut tiff = encode(rgb.clone(), ImageFormat::Tiff);
+        tiff.format = "tiff".to_owned();
+        assert_eq!(compressed_to_rgb(&tiff).unwrap().data, rgb.clone().into_raw());
+        let wide = encode(DynamicImage::ImageRgb8(rgb.clone()).into_rgb16(), ImageFormat::Tiff);
+        assert_eq!(compressed_to_rgb(&wide).unwrap().data, rgb.into_raw());
+        assert!(matches!(compressed_of_size(&wide, Some((5, 9))), Err(DecodeError::Size { .. })));
+    }
+
+    #[test]
+    fn what_is_not_colour_or_not_decoded_is_named() {
+        for format in ["16UC1; compressedDepth png", "32FC1; compressedDepth", "16UC1; png compressed ", "h264", "av1"]
+        {
+            let mut m = encode(GrayImage::new(4, 4), ImageFormat::Png);
+            if !format.contains("png") {
+                m.data = vec![0, 0, 0, 1, 9, 9];
+            }
+            m.format = format.to_owned();
+            let e = compressed_to_rgb(&m).unwrap_err();
+            assert!(matches!(e, DecodeError::Encoding { .. }), "{format}: {e}");
+            assert!(e.to_string().contains(format) && e.to_string().contains("motion JPEG"), "{e}");
+        }
+        // A name nobody knows is no reason to refuse a file that is known.
+        let mut m = encode(RgbImage::new(4, 4), ImageFormat::Png);
+        m.format = "lossless".to_owned();
+        assert!(compressed_to_rgb(&m).is_ok());
+    }
+
+    #[test]
     fn claims_and_damage_are_refused() {
         let mut png = encode(RgbImage::new(4, 4), ImageFormat::Png);
         // Width and height of the header, and its checksum.
@@ -126,9 +242,11 @@ mod tests {
         let whole = encode(RgbImage::new(4, 4), ImageFormat::Jpeg);
         assert_eq!(compressed_of_size(&whole, Some((4, 4))).unwrap(), compressed_to_rgb(&whole).unwrap());
 
-        for (data, says) in
-            [(vec![], "empty"), (b"GIF89a....".to_vec(), "neither JPEG nor PNG"), (vec![0xff, 0xd8, 0xff], "bytes")]
-        {
+        for (data, says) in [
+            (vec![], "empty"),
+            (b"GIF89a....".to_vec(), "neither JPEG nor PNG nor TIFF"),
+            (vec![0xff, 0xd8, 0xff], "bytes"),
+        ] {
             let message = CompressedImage { format: "jpeg".to_owned(), data, ..CompressedImage::default() };
             let e = compressed_to_rgb(&message).unwrap_err().to_string();
             assert!(e.contains(says), "{e}");
@@ -137,9 +255,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn damaged_files_never_panic(png in any::<bool>(), flips in proptest::collection::vec((0.0f64..1.0, any::<u8>()), 1..8), keep in 0.0f64..1.0) {
+        fn damaged_files_never_panic(kind in prop::sample::select(vec![ImageFormat::Png, ImageFormat::Jpeg, ImageFormat::Tiff]), flips in proptest::collection::vec((0.0f64..1.0, any::<u8>()), 1..8), keep in 0.0f64..1.0) {
             let picture = RgbImage::from_fn(33, 17, |x, y| image::Rgb([(x * y) as u8, x as u8, y as u8]));
-            let mut message = encode(picture, if png { ImageFormat::Png } else { ImageFormat::Jpeg });
+            let mut message = encode(picture, kind);
             let n = message.data.len();
             for (at, value) in flips {
                 message.data[(at * n as f64) as usize] = value;

@@ -6,7 +6,12 @@ use super::rows::{rows, sample_f32, sample16};
 use crate::msg::Image;
 
 /// Metres per unit of `16UC1` depth (REP 118: millimetres).
-const METRES_PER_MM: f32 = 1e-3;
+pub(super) const METRES_PER_MM: f32 = 1e-3;
+
+/// A depth in metres, or NaN for what is none (REP 118).
+pub(super) fn depth_or_nan(metres: f32) -> f32 {
+    if metres.is_finite() && metres > 0.0 { metres } else { f32::NAN }
+}
 
 fn refused(image: &Image, wanted: &'static str, accepted: &'static str) -> DecodeError {
     DecodeError::Encoding { found: image.encoding.clone(), wanted, accepted }
@@ -37,7 +42,7 @@ pub fn image_to_depth(image: &Image) -> Result<DepthPicture, DecodeError> {
         _ => return Err(refused(image, "depth", "16UC1 (millimetres), 32FC1 (metres)")),
     }
     for d in &mut data {
-        *d = if d.is_finite() && *d > 0.0 { *d } else { f32::NAN };
+        *d = depth_or_nan(*d);
     }
     Ok(DepthPicture { width, height, data })
 }
