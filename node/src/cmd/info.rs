@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use super::Outcome;
 use crate::bag::Bag;
 use crate::config::Config;
-use crate::source::TopicPlan;
+use crate::source::bag::plan_of;
 use crate::source::topics::PoseTopic;
 
 /// Arguments of `storm info`.
@@ -37,9 +37,12 @@ pub fn run(args: &Args) -> Result<Outcome> {
     }
     let problems = bag.problems();
     problems.iter().for_each(|p| say!("problem: {p}"));
-    let plan = TopicPlan::resolve(bag.topics(), &config.input)?;
+    let plan = plan_of(&bag, &config.input)?;
     for (i, c) in plan.cameras.iter().enumerate() {
         say!("camera {i}: {} with {}", c.name, bag.topics()[c.info].name);
+    }
+    for left_out in &plan.left_out {
+        say!("no camera: {left_out}");
     }
     match plan.pose {
         PoseTopic::Message(t) => say!("pose: {}", bag.topics()[t].name),

@@ -2,6 +2,7 @@
 
 use crate::bag::Topic;
 use crate::config::Config;
+use crate::source::cameras::LeftOut;
 use crate::source::topics::{PoseTopic, TopicPlan};
 
 use super::names::Names;
@@ -42,6 +43,8 @@ pub struct LivePlan {
     pub cameras: Vec<LiveCamera>,
     /// The vehicle pose.
     pub pose: LivePose,
+    /// Image topics that are no cameras.
+    pub left_out: Vec<LeftOut>,
 }
 
 impl LivePlan {
@@ -92,7 +95,7 @@ impl LivePlan {
                 input.camera_infos.clear();
             }
         }
-        let plan = TopicPlan::resolve(&graph, &input).map_err(|e| e.to_string())?;
+        let plan = TopicPlan::resolve(&graph, &input, &|_| None).map_err(|e| e.to_string())?;
         let found = plan.cameras.len();
         if config.live.cameras != 0 && config.live.cameras != found {
             let names: Vec<&str> = plan.cameras.iter().map(|c| c.name.as_str()).collect();
@@ -111,7 +114,7 @@ impl LivePlan {
                 type_name: graph.get(t).map(|t| t.type_name.clone()).unwrap_or_default(),
             },
         };
-        Ok((Self { cameras, pose }, named || config.live.cameras != 0))
+        Ok((Self { cameras, pose, left_out: plan.left_out }, named || config.live.cameras != 0))
     }
 }
 

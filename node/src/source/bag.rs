@@ -4,18 +4,19 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
-use tracing::warn;
+use tracing::{info, warn};
 
 use crate::bag::Bag;
 use crate::cdr::decode as cdr;
-use crate::config::{Config, SyncConfig};
+use crate::config::{Config, InputConfig, SyncConfig};
 use crate::msg::{CameraInfo, TransformStamped};
 use crate::sync::DropReason;
 use crate::tf::TfTree;
 
 use super::event::Event;
+use super::first::FirstPictures;
 use super::rig::{CameraDescription, Rig};
-use super::topics::{PoseTopic, TopicPlan};
+use super::topics::{COMPRESSED, PoseTopic, TopicError, TopicPlan};
 use super::translate::{Role, translate};
 
 /// Losses of one topic that are written to the log one by one; the rest is only counted.
@@ -39,9 +40,12 @@ impl BagSource {
         if bag.message_count() == 0 {
             anyhow::bail!("bag {} holds no messages", path.display());
         }
-        let plan =
-            TopicPlan::resolve(bag.topics(), &config.input).with_context(|| format!("bag {}", path.display()))?;
-        let (described, pose_child, static_transforms) = describe(&bag, &plan)?;
+        let plan = plan_of(&bag, &config.input).with_context(|| format!("bag {}", path.display()))?;
+        for left_out in &plan.left_out {
+            info!("no camera: {left_out}");
+        }
+        let (described, pose_child, static_transforms) =
+            describe(&bag, &plan).with_context(|| format!("bag {}", path.display()))?;
         let rig = Rig::build(
             described,
             &static_tree(&config.sync, &static_transforms),
@@ -55,7 +59,8 @@ impl BagSource {
             roles[c.image] = Role::Image { camera, compressed: c.compressed };
         }
         for &(camera, kind, topic) in &plan.truth {
-            roles[topic] = Role::Truth { camera, kind };
+            let compressed = bag.topics()[topic].type_name == COMPRESSED;
+            roles[topic] = Role::Truth { camera, kind, compressed };
         }
         match plan.pose {
             PoseTopic::Message(topic) => {
@@ -131,6 +136,21 @@ impl BagSource {
     }
 }
 
+/// The topics of `bag` by part; image topics are looked at, since an encoding may say that one shows no colour.
+///
+/// # Errors
+/// A part that no topic plays, or several could.
+pub fn plan_of(bag: &Bag, config: &InputConfig) -> Result<TopicPlan, TopicError> {
+    let first = |topic: usize| {
+        let message = bag.messages(&[topic]).ok()?.find_map(Result::ok)?;
+        match bag.topics()[topic].type_name.as_str() {
+            COMPRESSED => cdr::compressed_image(&message.data).ok().map(|m| m.format),
+            _ => cdr::image(&message.data).ok().map(|m| m.encoding),
+        }
+    };
+    TopicPlan::resolve(bag.topics(), config, &first)
+}
+
 /// A transform tree that holds what /tf_static said; transforms that cannot be used are named in the log.
 pub fn static_tree(sync: &SyncConfig, transforms: &[TransformStamped]) -> TfTree {
     let mut tree = TfTree::new(sync);
@@ -142,12 +162,14 @@ pub fn static_tree(sync: &SyncConfig, transforms: &[TransformStamped]) -> TfTree
     tree
 }
 
-/// Reads ahead until every camera is described: CameraInfo, first image's frame, /tf_static, the pose's child frame.
+/// Reads ahead until every camera is described: CameraInfo, first image's frame, a picture that can be decoded, /tf_static,
+/// the pose's child frame.
 fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, String, Vec<TransformStamped>)> {
     let mut statics = Vec::new();
     let n = plan.cameras.len();
     let mut infos: Vec<Option<CameraInfo>> = vec![None; n];
     let mut frames: Vec<Option<String>> = vec![None; n];
+    let mut pictures = FirstPictures::new(n);
     let mut pose_child: Option<String> = None;
     let pose_topic = match plan.pose {
         PoseTopic::Message(t) => Some(t),
@@ -181,12 +203,16 @@ fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, Stri
             if c.image == m.topic && frames[i].is_none() {
                 frames[i] = cdr::header(&m.data).ok().map(|h| h.frame_id);
             }
+            if c.image == m.topic {
+                pictures.take(i, c, &m.data)?;
+            }
         }
-        let described = infos.iter().all(Option::is_some) && frames.iter().all(Option::is_some);
+        let described = infos.iter().all(Option::is_some) && frames.iter().all(Option::is_some) && pictures.done();
         if described && statics_left == 0 && (pose_topic.is_none() || pose_child.is_some()) {
             break;
         }
     }
+    pictures.finish(&plan.cameras)?;
     let described = plan
         .cameras
         .iter()

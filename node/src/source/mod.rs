@@ -2,7 +2,9 @@
 //! topics and recorded bags give the same events, so everything behind them is one program.
 
 pub mod bag;
+pub mod cameras;
 pub mod event;
+mod first;
 pub mod rig;
 pub mod topics;
 pub mod translate;

@@ -6,12 +6,14 @@ use thiserror::Error;
 use crate::bag::Topic;
 use crate::config::InputConfig;
 
+use super::cameras::{self, FirstEncoding, LeftOut, picture_name};
+
 /// Most cameras the network takes.
 pub const MAX_CAMERAS: usize = 6;
 
-const IMAGE: &str = "sensor_msgs/msg/Image";
-const COMPRESSED: &str = "sensor_msgs/msg/CompressedImage";
-const CAMERA_INFO: &str = "sensor_msgs/msg/CameraInfo";
+pub(super) const IMAGE: &str = "sensor_msgs/msg/Image";
+pub(super) const COMPRESSED: &str = "sensor_msgs/msg/CompressedImage";
+pub(super) const CAMERA_INFO: &str = "sensor_msgs/msg/CameraInfo";
 const TF: &str = "tf2_msgs/msg/TFMessage";
 /// Message types a vehicle pose comes in.
 pub const POSE_TYPES: [&str; 4] = [
@@ -20,9 +22,6 @@ pub const POSE_TYPES: [&str; 4] = [
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
 ];
-/// Parts of topic names that say an image is not a camera picture.
-const NOT_A_PICTURE: [&str; 6] = ["depth", "mask", "disparity", "label", "confidence", "semantic"];
-
 /// Why the topics of a recording cannot be matched to their parts. The message lists what was found and names the fix.
 #[derive(Debug, Error)]
 pub enum TopicError {
@@ -53,6 +52,17 @@ pub enum TopicError {
     None {
         /// What was looked for.
         part: &'static str,
+        /// All topics with their types.
+        found: String,
+    },
+    /// No topic shows camera pictures.
+    #[error(
+        "no camera image topic{}; there are: {found}",
+        if left_out.is_empty() { String::new() } else { format!("; left out: {left_out}; if one is a camera all the same, name it in input.images") }
+    )]
+    NoCamera {
+        /// Image topics that are no cameras, with the reason.
+        left_out: String,
         /// All topics with their types.
         found: String,
     },
@@ -111,7 +121,7 @@ impl TruthKind {
 }
 
 /// The recording's topics by part.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TopicPlan {
     /// Cameras, in the network's order.
     pub cameras: Vec<CameraTopics>,
@@ -123,16 +133,21 @@ pub struct TopicPlan {
     pub tf_static: Vec<usize>,
     /// Ground truth: camera, kind, topic.
     pub truth: Vec<(usize, TruthKind, usize)>,
+    /// Image topics that are no cameras.
+    pub left_out: Vec<LeftOut>,
 }
 
 impl TopicPlan {
-    /// Matches `topics` to their parts.
-    pub fn resolve(topics: &[Topic], config: &InputConfig) -> Result<Self, TopicError> {
-        let images = if config.images.is_empty() {
-            find_images(topics, config)?
+    /// Matches `topics` to their parts; `first` tells encodings where the messages can be looked at.
+    ///
+    /// # Errors
+    /// A part that no topic plays, or several could.
+    pub fn resolve(topics: &[Topic], config: &InputConfig, first: FirstEncoding) -> Result<Self, TopicError> {
+        let (images, left_out) = if config.images.is_empty() {
+            cameras::find(topics, config, first)?
         } else {
             let by_name = |name: &String| named(topics, "input.images", name, &[IMAGE, COMPRESSED]);
-            config.images.iter().map(by_name).collect::<Result<_, _>>()?
+            (config.images.iter().map(by_name).collect::<Result<_, _>>()?, Vec::new())
         };
         let mut cameras = Vec::new();
         for (i, &image) in images.iter().enumerate() {
@@ -150,15 +165,17 @@ impl TopicPlan {
         let (tf, tf_static) = (of_tf(false), of_tf(true));
         let pose = find_pose(topics, config, !tf.is_empty())?;
         let truth = find_truth(topics, config, &cameras);
-        Ok(Self { cameras, pose, tf, tf_static, truth })
+        Ok(Self { cameras, pose, tf, tf_static, truth, left_out })
     }
 }
 
-fn is_truth(topic: &Topic, config: &InputConfig) -> bool {
+/// True for topics that hold ground truth.
+pub(super) fn is_truth(topic: &Topic, config: &InputConfig) -> bool {
     !config.truth_prefix.is_empty() && topic.name.starts_with(&config.truth_prefix)
 }
 
-fn list<'a>(topics: impl Iterator<Item = &'a Topic>) -> String {
+/// Names and types, as errors list them.
+pub(super) fn list<'a>(topics: impl Iterator<Item = &'a Topic>) -> String {
     let names: Vec<String> = topics.map(|t| format!("{} ({})", t.name, t.type_name)).collect();
     if names.is_empty() { "none".into() } else { names.join(", ") }
 }
@@ -174,66 +191,9 @@ fn named(topics: &[Topic], key: &'static str, name: &str, types: &[&str]) -> Res
     Err(TopicError::Type { key, topic: name.into(), found: topics[i].type_name.clone(), wanted: types.join(" or ") })
 }
 
-/// The topic without the transport suffix: `/a/image_rect/compressed` and `/a/image_rect` are one picture.
-fn picture_name(name: &str) -> &str {
-    name.strip_suffix("/compressed").unwrap_or(name)
-}
-
-fn parent(name: &str) -> &str {
+/// The name without its last part.
+pub(super) fn parent(name: &str) -> &str {
     name.rsplit_once('/').map_or("", |(p, _)| p)
-}
-
-fn find_images(topics: &[Topic], config: &InputConfig) -> Result<Vec<usize>, TopicError> {
-    let picture = |t: &Topic| {
-        let last = picture_name(&t.name).rsplit('/').next().unwrap_or("");
-        let kind = t.type_name == IMAGE || t.type_name == COMPRESSED;
-        kind && t.count > 0 && !is_truth(t, config) && !NOT_A_PICTURE.iter().any(|w| last.contains(w))
-    };
-    let mut found: Vec<usize> = (0..topics.len()).filter(|&i| picture(&topics[i])).collect();
-    // Of a raw topic and its compressed twin the raw one is used: nothing lost, nothing to decode.
-    let raw: Vec<String> =
-        found.iter().filter(|&&i| topics[i].type_name == IMAGE).map(|&i| topics[i].name.clone()).collect();
-    found.retain(|&i| topics[i].type_name == IMAGE || !raw.iter().any(|r| r == picture_name(&topics[i].name)));
-    if found.is_empty() {
-        return Err(TopicError::None { part: "camera image topic", found: list(topics.iter()) });
-    }
-    found.sort_by(|&a, &b| natural(&topics[a].name).cmp(&natural(&topics[b].name)));
-    let twins = found.windows(2).any(|w| {
-        let dir = |i: usize| parent(picture_name(&topics[i].name)).to_string();
-        !dir(w[0]).is_empty() && dir(w[0]) == dir(w[1]) && shares_info(topics, &dir(w[0]))
-    });
-    if twins || found.len() > MAX_CAMERAS {
-        let why = if twins { "two pictures of one camera" } else { "more than 6 image topics" };
-        return Err(TopicError::Ambiguous {
-            part: format!("the set of cameras ({why})"),
-            key: "input.images",
-            candidates: list(found.iter().map(|&i| &topics[i])),
-        });
-    }
-    Ok(found)
-}
-
-/// True when `dir` holds one CameraInfo for all its images, so that several images there are of one camera.
-fn shares_info(topics: &[Topic], dir: &str) -> bool {
-    topics.iter().any(|t| t.type_name == CAMERA_INFO && parent(&t.name) == dir)
-}
-
-/// Splits a name into text and numbers, so that camera10 sorts after camera9.
-pub fn natural(name: &str) -> Vec<(String, u64)> {
-    let mut parts = Vec::new();
-    let (mut text, mut digits) = (String::new(), String::new());
-    for c in name.chars() {
-        if c.is_ascii_digit() {
-            digits.push(c);
-            continue;
-        }
-        if !digits.is_empty() {
-            parts.push((std::mem::take(&mut text), std::mem::take(&mut digits).parse().unwrap_or(u64::MAX)));
-        }
-        text.push(c);
-    }
-    parts.push((text, digits.parse().unwrap_or(0)));
-    parts
 }
 
 fn find_info(topics: &[Topic], image: &str) -> Result<usize, TopicError> {
@@ -276,7 +236,8 @@ fn find_pose(topics: &[Topic], config: &InputConfig, has_tf: bool) -> Result<Pos
     }
 }
 
-/// Ground truth of camera i is below `<prefix>/<the camera's own namespace>/{depth,flow,moving,sky,instance}`.
+/// Ground truth of camera i is below `<prefix>/<the camera's own namespace>/{depth,flow,moving,sky,instance}`;
+/// depth may be packed (`depth/compressedDepth`).
 fn find_truth(topics: &[Topic], config: &InputConfig, cameras: &[CameraTopics]) -> Vec<(usize, TruthKind, usize)> {
     let mut truth = Vec::new();
     for (camera, c) in cameras.iter().enumerate() {
@@ -290,7 +251,12 @@ fn find_truth(topics: &[Topic], config: &InputConfig, cameras: &[CameraTopics]) 
         ];
         for (kind, last) in kinds {
             let name = format!("{}{dir}/{last}", config.truth_prefix);
-            let found = topics.iter().position(|t| t.name == name && t.type_name == IMAGE);
+            let raw = topics.iter().position(|t| t.name == name && t.type_name == IMAGE);
+            let packed = || {
+                let name = format!("{name}/compressedDepth");
+                topics.iter().position(|t| t.name == name && t.type_name == COMPRESSED)
+            };
+            let found = if kind == TruthKind::Depth { raw.or_else(packed) } else { raw };
             truth.extend(found.map(|topic| (camera, kind, topic)));
         }
     }
@@ -318,7 +284,7 @@ mod tests {
 
     #[test]
     fn a_stereo_bag_needs_no_configuration() {
-        let plan = TopicPlan::resolve(&stereo(), &InputConfig::default()).unwrap();
+        let plan = TopicPlan::resolve(&stereo(), &InputConfig::default(), &|_| None).unwrap();
         assert_eq!((plan.cameras[0].image, plan.cameras[0].info), (1, 2));
         assert_eq!((plan.cameras[1].image, plan.cameras[1].info), (0, 3));
         assert_eq!(plan.pose, PoseTopic::Message(4));
@@ -331,7 +297,7 @@ mod tests {
         topics.push(topic("/camera/left/image_rect", IMAGE));
         topics.push(topic("/ground_truth/camera/left/depth", IMAGE));
         topics.push(topic("/ground_truth/odom", POSE_TYPES[0]));
-        let plan = TopicPlan::resolve(&topics, &InputConfig::default()).unwrap();
+        let plan = TopicPlan::resolve(&topics, &InputConfig::default(), &|_| None).unwrap();
         assert_eq!(plan.cameras.len(), 2);
         assert_eq!(plan.cameras[0].image, 6);
         assert_eq!(plan.truth, vec![(0, TruthKind::Depth, 7)]);
@@ -341,31 +307,24 @@ mod tests {
     fn ambiguity_lists_the_candidates() {
         let mut topics = stereo();
         topics.push(topic("/other_pose", POSE_TYPES[1]));
-        let e = TopicPlan::resolve(&topics, &InputConfig::default()).unwrap_err().to_string();
+        let e = TopicPlan::resolve(&topics, &InputConfig::default(), &|_| None).unwrap_err().to_string();
         assert!(e.contains("/other_pose") && e.contains("/odometry") && e.contains("input.pose"), "{e}");
         let config = InputConfig { pose: "/other_pose".into(), ..Default::default() };
-        assert_eq!(TopicPlan::resolve(&topics, &config).unwrap().pose, PoseTopic::Message(6));
+        assert_eq!(TopicPlan::resolve(&topics, &config, &|_| None).unwrap().pose, PoseTopic::Message(6));
         let mut topics = stereo();
         topics.push(topic("/camera/left/image_raw", IMAGE));
-        let e = TopicPlan::resolve(&topics, &InputConfig::default()).unwrap_err().to_string();
+        let e = TopicPlan::resolve(&topics, &InputConfig::default(), &|_| None).unwrap_err().to_string();
         assert!(e.contains("two pictures of one camera"), "{e}");
     }
 
     #[test]
     fn what_is_missing_is_said() {
-        let e = TopicPlan::resolve(&stereo()[2..], &InputConfig::default()).unwrap_err().to_string();
+        let e = TopicPlan::resolve(&stereo()[2..], &InputConfig::default(), &|_| None).unwrap_err().to_string();
         assert!(e.contains("no camera image topic") && e.contains("/odometry"), "{e}");
-        let e = TopicPlan::resolve(&stereo()[..4], &InputConfig::default()).unwrap_err().to_string();
+        let e = TopicPlan::resolve(&stereo()[..4], &InputConfig::default(), &|_| None).unwrap_err().to_string();
         assert!(e.contains("no vehicle pose"), "{e}");
         let config = InputConfig { pose: "/odom".into(), ..Default::default() };
-        let e = TopicPlan::resolve(&stereo(), &config).unwrap_err().to_string();
+        let e = TopicPlan::resolve(&stereo(), &config, &|_| None).unwrap_err().to_string();
         assert!(e.contains("/odom,") && e.contains("/odometry"), "{e}");
-    }
-
-    #[test]
-    fn numbers_in_names_sort_as_numbers() {
-        let mut names = ["/camera10/image", "/camera9/image", "/camera1/image"];
-        names.sort_by_key(|n| natural(n));
-        assert_eq!(names, ["/camera1/image", "/camera9/image", "/camera10/image"]);
     }
 }

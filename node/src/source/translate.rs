@@ -38,6 +38,8 @@ pub enum Role {
         camera: usize,
         /// What it holds.
         kind: TruthKind,
+        /// True for CompressedImage.
+        compressed: bool,
     },
     /// Nothing.
     None,
@@ -71,7 +73,8 @@ fn events(rig: &Rig, role: &Role, data: &[u8]) -> Result<Vec<Event>> {
         Role::StaticTransform => {
             cdr::tf_message(data)?.into_iter().map(|t| Event::StaticTransform(Box::new(t))).collect()
         }
-        Role::Truth { camera, kind } => vec![truth(*camera, *kind, data)?],
+        Role::Truth { camera, compressed: true, .. } => vec![packed_depth(*camera, data)?],
+        Role::Truth { camera, kind, compressed: false } => vec![truth(*camera, *kind, data)?],
         Role::None => Vec::new(),
     })
 }
@@ -97,4 +100,18 @@ fn truth(camera: usize, kind: TruthKind, data: &[u8]) -> Result<Event> {
         TruthKind::Moving | TruthKind::Sky | TruthKind::Instance => Truth::Mask(decode::image_to_labels(&image)?),
     };
     Ok(Event::Truth { camera, stamp_ns: image.header.stamp_ns, kind, width, height, data: Arc::new(data) })
+}
+
+/// Ground-truth depth in a CompressedImage.
+fn packed_depth(camera: usize, data: &[u8]) -> Result<Event> {
+    let message = cdr::compressed_image(data)?;
+    let depth = decode::compressed_to_depth(&message)?;
+    Ok(Event::Truth {
+        camera,
+        stamp_ns: message.header.stamp_ns,
+        kind: TruthKind::Depth,
+        width: depth.width,
+        height: depth.height,
+        data: Arc::new(Truth::Depth(depth.data)),
+    })
 }

@@ -18,6 +18,7 @@ use crate::bag;
 use crate::engine::{Engine, ModelSource, UNTRAINED};
 use crate::pipeline::live::{Live, LiveOptions, inbox};
 use crate::source::Rig;
+use crate::source::cameras::is_video;
 
 /// Topics found by type count once they have been the same for so long.
 const SETTLED: Duration = Duration::from_secs(2);
@@ -50,7 +51,7 @@ impl Running {
             .filter_map(|(name, types)| {
                 let type_name = types.into_iter().next()?;
                 let relevant = ["sensor_msgs/", "nav_msgs/", "geometry_msgs/", "tf2_msgs/"];
-                if !relevant.iter().any(|package| type_name.starts_with(package)) {
+                if !relevant.iter().any(|package| type_name.starts_with(package)) && !is_video(&type_name) {
                     return None;
                 }
                 let publishers = self.node.get_publishers_info_by_topic(&name, false).map_or(0, |p| p.len());
@@ -107,6 +108,7 @@ impl Running {
         for (i, c) in plan.cameras.iter().enumerate() {
             info!("camera {i}: {} with {}", c.image, c.info);
         }
+        plan.left_out.iter().for_each(|l| info!("no camera: {l}"));
         info!("pose: {:?}", plan.pose);
         self.streams = streams(&plan, &self.config.live);
         for (number, stream) in self.streams.iter().enumerate() {
