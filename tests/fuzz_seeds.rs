@@ -92,6 +92,7 @@ fn seeds_to_folders() {
         ("bag", seeds::bag()),
         ("cdr", seeds::cdr()),
         ("image", seeds::image()),
+        ("compressed", seeds::compressed()),
         ("weights", seeds::weights()),
         ("map", seeds::map()),
         ("config", seeds::config()),
@@ -117,6 +118,11 @@ fn messages() {
 #[test]
 fn pictures() {
     exercise("image", targets::image, seeds::image(), 6000);
+}
+
+#[test]
+fn compressed_pictures() {
+    exercise("compressed", targets::compressed, seeds::compressed(), 6000);
 }
 
 #[test]

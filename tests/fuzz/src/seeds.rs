@@ -4,7 +4,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 use glam::{DQuat, DVec3};
-use image::{ImageFormat, RgbImage};
+use image::{DynamicImage, ImageFormat, RgbImage};
 use storm_node::cdr::encode;
 use storm_node::cdr::schema::MessageType;
 use storm_node::config::{Config, MapConfig};
@@ -24,7 +24,7 @@ fn picture() -> RgbImage {
     RgbImage::from_fn(CAMERA.0 as u32, CAMERA.1 as u32, |x, y| image::Rgb([x as u8 * 8, y as u8 * 16, 70]))
 }
 
-fn compressed(format: ImageFormat) -> Vec<u8> {
+fn compressed_file(format: ImageFormat) -> Vec<u8> {
     let mut data = Vec::new();
     picture().write_to(&mut Cursor::new(&mut data), format).expect("memory takes it");
     data
@@ -64,7 +64,7 @@ fn transforms() -> Vec<TransformStamped> {
 /// Every message type there is, as CDR.
 pub fn cdr() -> Vec<Vec<u8>> {
     let cloud = PointCloud2 { width: 2, height: 1, point_step: 4, row_step: 8, data: vec![0; 8], ..Default::default() };
-    let jpeg = CompressedImage { header: header(1), format: "jpeg".into(), data: compressed(ImageFormat::Jpeg) };
+    let jpeg = CompressedImage { header: header(1), format: "jpeg".into(), data: compressed_file(ImageFormat::Jpeg) };
     [
         encode::encode_image(&raw(1)),
         encode::encode_compressed_image(&jpeg),
@@ -169,7 +169,7 @@ pub fn bag() -> Vec<Vec<u8>> {
 
 /// Files of both kinds, and rows of every encoding.
 pub fn image() -> Vec<Vec<u8>> {
-    let file = |format| [vec![1], compressed(format)].concat();
+    let file = |format| [vec![1], compressed_file(format)].concat();
     // Found by fuzzing: sums of brightness that overflow in the JPEG decoder, and 801 bytes that claim 314 megapixels.
     let overflow = include_bytes!("../found/image_dc_overflow").to_vec();
     let large = include_bytes!("../found/image_many_pixels").to_vec();
@@ -180,6 +180,55 @@ pub fn image() -> Vec<Vec<u8>> {
         all.push([&head[..], &(0..144).map(|b| b as u8).collect::<Vec<_>>()].concat());
     }
     all
+}
+
+/// CompressedImages as image_transport's plugins and USB cameras send them.
+pub fn compressed() -> Vec<Vec<u8>> {
+    let message = |format: &str, data: &[u8]| [&[format.len() as u8], format.as_bytes(), data].concat();
+    let file = |picture: DynamicImage, kind| {
+        let mut data = Vec::new();
+        picture.write_to(&mut Cursor::new(&mut data), kind).expect("memory takes it");
+        data
+    };
+    let (colour, grey) = (DynamicImage::from(picture()), DynamicImage::from(picture()).into_luma8());
+    let deep = DynamicImage::from(grey.clone()).into_luma16();
+    let depth_png =
+        [&[0; 4][..], &10100f32.to_le_bytes(), &(-1009f32).to_le_bytes(), &file(deep.clone().into(), ImageFormat::Png)]
+            .concat();
+    let raw = raw(1);
+    let mut packed = [raw.height.to_le_bytes(), raw.width.to_le_bytes()].concat();
+    packed.push(0);
+    packed.extend([raw.step.to_le_bytes(), 4u32.to_le_bytes()].concat());
+    packed.extend(b"rgb8");
+    packed.extend(zstd::encode_all(&raw.data[..], 1).expect("memory takes it"));
+    let whole = encode::encode_image(&raw).expect("a sound message");
+    vec![
+        message("tiff", &file(colour.clone(), ImageFormat::Tiff)),
+        message("16UC1; tiff compressed ", &file(deep.into(), ImageFormat::Tiff)),
+        message("rgb16; tiff compressed bgr16", &file(colour.clone().into_rgb16().into(), ImageFormat::Tiff)),
+        message("mjpeg", &without_tables(&file(colour, ImageFormat::Jpeg))),
+        message("bayer_rggb8; jpeg compressed ", &file(grey.clone().into(), ImageFormat::Jpeg)),
+        message("bayer_gbrg8; png compressed ", &file(grey.into(), ImageFormat::Png)),
+        message("32FC1; compressedDepth png", &depth_png),
+        message("16UC1; compressedDepth", &depth_png),
+        message("zstd", &packed),
+        message("zstd", &zstd::encode_all(&whole[..], 1).expect("memory takes it")),
+        message("bgr8; jpeg compressed bgr8", &compressed_file(ImageFormat::Jpeg)),
+    ]
+}
+
+/// A JPEG without its DHT segments.
+fn without_tables(file: &[u8]) -> Vec<u8> {
+    let (mut out, mut at) = (file[..2].to_vec(), 2);
+    while file[at + 1] != 0xda {
+        let end = at + 2 + usize::from(u16::from_be_bytes([file[at + 2], file[at + 3]]));
+        if file[at + 1] != 0xc4 {
+            out.extend(&file[at..end]);
+        }
+        at = end;
+    }
+    out.extend(&file[at..]);
+    out
 }
 
 /// A state dict of one tensor of 4 x 8 numbers as `torch.save` pickles it, and the smallest safetensors files.

@@ -15,7 +15,8 @@ use storm_node::bag::Bag;
 use storm_node::cdr::decode as cdr_decode;
 use storm_node::config::Config;
 use storm_node::decode::{
-    Rectifier, RgbPicture, compressed_to_rgb, image_to_depth, image_to_labels, image_to_rgb, image_to_vectors,
+    Codec, Format, Rectifier, RgbPicture, Shows, compressed_to_depth, compressed_to_rgb, image_to_depth,
+    image_to_labels, image_to_rgb, image_to_vectors,
 };
 use storm_node::map::{MapCloud, StaticMap};
 use storm_node::msg::{CameraInfo, CompressedImage, Header, Image};
@@ -37,7 +38,7 @@ pub const NETWORK: (usize, usize) = (16, 8);
 /// Picture size of the cameras.
 pub const CAMERA: (usize, usize) = (32, 16);
 /// Encodings the image target draws from.
-pub const ENCODINGS: [&str; 16] = [
+pub const ENCODINGS: [&str; 24] = [
     "rgb8",
     "bgr8",
     "rgba8",
@@ -54,6 +55,14 @@ pub const ENCODINGS: [&str; 16] = [
     "32FC1",
     "16UC1",
     "32FC3",
+    "rgba16",
+    "16UC3",
+    "vyuy",
+    "nv12",
+    "nv21",
+    "nv24",
+    "i420",
+    "yv12",
 ];
 /// Pictures larger than this are not rectified: that takes time in proportion, which is no finding.
 const MOST_PIXELS: usize = 1 << 20;
@@ -225,6 +234,28 @@ fn rectify(info: &CameraInfo) {
         assert_eq!(out.data.len(), NETWORK.0 * NETWORK.1 * 3);
         let k = rectifier.intrinsics();
         assert!([k.fx, k.fy, k.cx, k.cy].iter().all(|x| x.is_finite()), "{k:?}");
+    }
+}
+
+/// A CompressedImage: the first byte is the length of its `format`, which follows, then its data. TIFF, motion JPEG without
+/// tables, compressedDepth and the zstd transport come this way.
+pub fn compressed(data: &[u8]) {
+    let mut b = Bytes(data);
+    let length = usize::from(b.u8());
+    let text = String::from_utf8_lossy(b.take(length)).into_owned();
+    let format = Format::parse(&text);
+    for part in [format.encoding, format.codec_name, format.stored] {
+        assert!(text.contains(part), "{part} is not in {text}");
+    }
+    let message = CompressedImage { header: header(), format: text.clone(), data: b.0.to_vec() };
+    if let Ok(p) = compressed_to_rgb(&message) {
+        assert_eq!(p.data.len(), p.width * p.height * 3);
+        assert!(format.shows() == Shows::Color && format.codec != Codec::Depth, "{text} shows no colour");
+    }
+    if let Ok(p) = compressed_to_depth(&message) {
+        assert_eq!(p.data.len(), p.width * p.height);
+        assert!(p.data.iter().all(|z| z.is_nan() || (z.is_finite() && *z > 0.0)));
+        assert!(format.shows() == Shows::Depth, "{text} shows no depth");
     }
 }
 
