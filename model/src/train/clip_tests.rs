@@ -5,6 +5,7 @@ use glam::Vec3;
 
 use super::clips::{ClipOptions, ClipPlan, HELD_OUT_SEEDS};
 use super::loader::{DataOptions, Loader};
+use super::looks::LookOptions;
 use crate::config::ModelConfig;
 
 fn small() -> ClipOptions {
@@ -149,4 +150,37 @@ fn variety_changes_lenses_and_cameras_and_nothing_else() {
     let cameras = |n: u64| data.batch(32 * n, &config).unwrap().context.dims().unwrap()[2];
     let seen: std::collections::BTreeSet<usize> = (0..12).map(cameras).collect();
     assert!(seen.contains(&3) && seen.len() >= 2, "{seen:?}");
+}
+
+#[test]
+fn looks_change_colours_of_training_clips_only() {
+    let config = ModelConfig::preset("tiny").unwrap();
+    let usual = small();
+    let varied = ClipOptions { looks: LookOptions { sensor: true, ..LookOptions::default() }, ..usual };
+    assert_eq!(ClipPlan::of_drive(10_500, &varied), ClipPlan::of_drive(10_500, &usual), "validation is plain");
+    let mut changed = 0;
+    for k in 0..8 {
+        let (a, b) = (ClipPlan::training(1, k, &usual), ClipPlan::training(1, k, &varied));
+        assert_eq!(a, ClipPlan { looks: LookOptions::default(), ..b.clone() });
+        let (one, other) = (a.make(&usual, &config).unwrap(), b.make(&varied, &config).unwrap());
+        let again = b.make(&varied, &config).unwrap();
+        assert_eq!(values(&other.context.image), values(&again.context.image));
+        assert!(values(&other.context.image).iter().all(|x| (-1.0..=1.0).contains(x)));
+        changed += usize::from(values(&one.context.image) != values(&other.context.image));
+        // What the sky terms are taught is what these cameras saw.
+        let sky = |clip: &super::clips::TrainClip| (values(&clip.sky.directions), values(&clip.sky.colors));
+        let image = values(&other.context.image);
+        assert_eq!(sky(&one).0, sky(&other).0);
+        let weights = values(&other.sky.weights);
+        for (c, _) in sky(&other).1.chunks(3).zip(&weights).filter(|(_, w)| **w == 1.0) {
+            assert!(image.contains(&c[0]));
+        }
+        let truth = |clip: &super::clips::TrainClip| {
+            let t = &clip.target.as_ref().unwrap().1;
+            (values(&t.depth), values(&t.flow), values(&t.sky), values(&t.moving))
+        };
+        assert_eq!(truth(&one), truth(&other));
+        assert_eq!(values(&one.context.world_from_camera), values(&other.context.world_from_camera));
+    }
+    assert!(changed >= 6, "{changed} of 8");
 }

@@ -11,6 +11,7 @@ use storm_render::Intrinsics;
 use storm_render::world::{Drive, DriveOptions, WorldFrame};
 
 use super::error::TrainError;
+use super::looks::{LookOptions, RigLook, Shutter};
 use super::truth::{SkySamples, Truth};
 use crate::clip::{ClipBatch, PixelLayout, ViewInput};
 use crate::config::ModelConfig;
@@ -53,6 +54,8 @@ pub struct ClipOptions {
     pub prior_sec: f64,
     /// Share of the blocks of training batches that have no prior images all the same, so that the network does without.
     pub prior_dropout: f64,
+    /// What of the look of training clips varies; validation clips are plain.
+    pub looks: LookOptions,
 }
 
 /// Share of the clips whose anchor is at the first timestep all the same.
@@ -80,6 +83,7 @@ impl Default for ClipOptions {
             anchor_lead: 0,
             prior_sec: 0.0,
             prior_dropout: 0.2,
+            looks: LookOptions::default(),
         }
     }
 }
@@ -142,7 +146,12 @@ pub struct ClipPlan {
     pub prior_sec: f64,
     /// How long before `start_sec` the anchor was where it is, and the clock began, seconds.
     pub lead_sec: f64,
+    /// What of the look varies; how follows from `drive_seed`.
+    pub looks: LookOptions,
 }
+
+/// Noise of a drive's own cameras whose images go through other ones, counts: enough to hide the steps between counts.
+const DITHER: f32 = 0.5;
 
 impl ClipPlan {
     /// Sample `index` of the training data of `seed`; never a held-out drive.
@@ -161,6 +170,7 @@ impl ClipPlan {
         if most > 0 && rng.random::<f64>() >= NO_LEAD_SHARE {
             plan.lead_sec = f64::from(rng.random_range(1..=most)) * options.stride_sec;
         }
+        plan.looks = options.looks;
         plan
     }
 
@@ -178,13 +188,23 @@ impl ClipPlan {
         target_sec.sort_by(f64::total_cmp);
         // There is nothing before the drive.
         let start_sec = f64::max(start_sec, options.prior_sec);
-        let prior_sec = options.prior_sec;
-        Self { drive_seed, start_sec, target_sec, traffic, zoom: [1.0; 2], prior_sec, lead_sec: 0.0 }
+        Self {
+            drive_seed,
+            start_sec,
+            target_sec,
+            traffic,
+            zoom: [1.0; 2],
+            prior_sec: options.prior_sec,
+            lead_sec: 0.0,
+            looks: LookOptions::default(),
+        }
     }
 
     /// Drives it. `config` says what the network's depth measures and where its rays pass.
     pub fn make(&self, options: &ClipOptions, config: &ModelConfig) -> Result<TrainClip, TrainError> {
         options.check()?;
+        let rig = if self.looks.sensor { RigLook::draw(self.drive_seed, options.cameras) } else { None };
+        let usual = DriveOptions::default();
         let drive = Drive::new(&DriveOptions {
             seed: self.drive_seed,
             seconds: options.drive_sec,
@@ -194,15 +214,16 @@ impl ClipPlan {
             rate_hz: RATE_HZ,
             traffic: self.traffic,
             zoom: self.zoom,
-            ..DriveOptions::default()
+            noise: if rig.is_some() { DITHER } else { usual.noise },
+            ..usual
         })?;
         let anchor_from_map = inverse(
             &(map_from_camera(&drive, options.reference(), self.start_sec - self.lead_sec) * camera_from_flu()),
         );
         let context_sec: Vec<f64> = (0..options.timesteps).map(|k| k as f64 * options.stride_sec).collect();
-        let shots = |times: &[f64]| self.shots(&drive, times, &anchor_from_map);
-        let context = shots(&context_sec);
-        let target = if self.target_sec.is_empty() { None } else { Some(shots(&self.target_sec)) };
+        let shots = |times: &[f64]| self.shots(&drive, rig.as_ref(), times, &anchor_from_map);
+        let context = shots(&context_sec)?;
+        let target = if self.target_sec.is_empty() { None } else { Some(shots(&self.target_sec)?) };
         let batch = |shots: &[Vec<Shot>]| -> Result<(ClipBatch, Truth), TrainError> {
             let clip = Shot::clip(shots, options.span_sec)?;
             Ok((clip, Truth::of(shots, &anchor_from_map.matrix3, config)?))
@@ -210,7 +231,7 @@ impl ClipPlan {
         let (mut clip, context_truth) = batch(&context)?;
         if self.prior_sec > 0.0 {
             let times: Vec<f64> = context_sec.iter().map(|t| t - self.prior_sec).collect();
-            clip.prior = Some(Box::new(Shot::clip(&shots(&times), options.span_sec)?));
+            clip.prior = Some(Box::new(Shot::clip(&shots(&times)?, options.span_sec)?));
         }
         Ok(TrainClip {
             context: clip,
@@ -220,16 +241,31 @@ impl ClipPlan {
         })
     }
 
-    fn shots(&self, drive: &Drive, times: &[f64], anchor_from_map: &DAffine3) -> Vec<Vec<Shot>> {
+    /// Images at `times` after the clip's start, `[time][camera]`.
+    fn shots(
+        &self,
+        drive: &Drive,
+        rig: Option<&RigLook>,
+        times: &[f64],
+        anchor_from_map: &DAffine3,
+    ) -> Result<Vec<Vec<Shot>>, TrainError> {
         let shot = |camera: usize, time_sec: f64| {
             let at = self.start_sec + time_sec;
-            let pose = *anchor_from_map * map_from_camera(drive, camera, at);
-            Shot {
-                frame: drive.render(camera, at),
-                intrinsics: drive.cameras()[camera].intrinsics,
-                anchor_from_camera: affine32(&pose),
-                time_sec: (self.lead_sec + time_sec) as f32,
+            let opens = map_from_camera(drive, camera, at);
+            let intrinsics = drive.cameras()[camera].intrinsics;
+            let mut frame = drive.render(camera, at);
+            if let Some(rig) = rig {
+                let open_sec = rig.open_sec();
+                let closes = map_from_camera(drive, camera, at + open_sec);
+                let shutter = Shutter { intrinsics, opens, closes, open_sec };
+                rig.take(&mut frame, camera, at, (open_sec > 0.0).then_some(&shutter))?;
             }
+            Ok(Shot {
+                frame,
+                intrinsics,
+                anchor_from_camera: affine32(&(*anchor_from_map * opens)),
+                time_sec: (self.lead_sec + time_sec) as f32,
+            })
         };
         times.iter().map(|&t| (0..drive.cameras().len()).map(|c| shot(c, t)).collect()).collect()
     }

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::adamw::AdamOptions;
 use super::clips::ClipOptions;
 use super::error::TrainError;
+use super::looks::LookOptions;
 use super::losses::RenderLossOptions;
 use super::muon::Optimizer;
 use super::pixel::PixelLossOptions;
@@ -184,7 +185,7 @@ impl TrainOptions {
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
-            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
+            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}{}{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
             self.history,
             self.seed,
             c.cameras,
@@ -198,6 +199,7 @@ impl TrainOptions {
                 0 => String::new(),
                 n => format!(", anchors up to {n} strides early"),
             },
+            if c.looks == LookOptions::default() { String::new() } else { format!(", looks {}", c.looks.describe()) },
             self.batch,
             match self.optimizer {
                 Optimizer::AdamW => "AdamW",

@@ -42,6 +42,7 @@ pub use options::{CAMERAS_MAX, DriveOptions, SECONDS_MAX, SIDE_MAX, WorldError};
 pub use picture::WorldFrame;
 pub use rig::DriveCamera;
 pub use road::District;
+pub use sensor::light_of_count;
 pub use stream::MoverClass;
 pub use truth::{Mover, Trajectories, Trajectory, TrajectoryOptions};
 
@@ -50,3 +51,5 @@ pub const MOVING_MPS: f32 = 0.01;
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod usual;

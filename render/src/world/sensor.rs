@@ -8,6 +8,21 @@ use glam::Vec3;
 const WHITE: f32 = 4.0;
 /// Counts of the tone curve are looked up by the square root of light in this many steps.
 const STEPS: usize = 1024;
+/// The display gamma behind the shoulder.
+const GAMMA: f32 = 1.9;
+
+/// Counts, 0 to 255, of an amount of light: a gentle shoulder (extended Reinhard) and a display gamma.
+fn tone(light: f32) -> f32 {
+    (light * (1.0 + light / (WHITE * WHITE)) / (1.0 + light)).min(1.0).powf(1.0 / GAMMA) * 255.0
+}
+
+/// The light, 0 to 4, that a drive's camera without noise shows as this count: what its tone curve took away is put back.
+pub fn light_of_count(count: u8) -> f32 {
+    let y = (f32::from(count) / 255.0).powf(GAMMA);
+    // x (1 + x / W^2) = y (1 + x) for x.
+    let half = 0.5 * WHITE * WHITE;
+    half * (y - 1.0 + ((1.0 - y) * (1.0 - y) + 2.0 * y / half).sqrt())
+}
 
 /// One camera's sensor at one moment.
 pub(crate) struct Sensor {
@@ -20,8 +35,6 @@ pub(crate) struct Sensor {
 impl Sensor {
     pub(crate) fn new(camera: &DriveCamera, brightness: f32, noise: f32, key: [u64; 3]) -> Self {
         let gain = Vec3::from(camera.white_balance) * (camera.exposure_gain * brightness);
-        // A gentle shoulder (extended Reinhard) and a display gamma.
-        let tone = |x: f32| (x * (1.0 + x / (WHITE * WHITE)) / (1.0 + x)).min(1.0).powf(1.0 / 1.9) * 255.0;
         let top = WHITE.sqrt();
         let curve = (0..=STEPS + 1).map(|i| tone((i as f32 / STEPS as f32 * top).powi(2))).collect();
         Self { gain, noise, key: fold(key[0], &key[1..]), curve }
@@ -57,6 +70,15 @@ impl Sensor {
 mod tests {
     use super::*;
     use crate::world::DriveOptions;
+
+    #[test]
+    fn light_comes_back_from_counts() {
+        for count in 0..=255u8 {
+            let light = light_of_count(count);
+            assert!((0.0..=WHITE + 1e-3).contains(&light), "{count}: {light}");
+            assert!((tone(light) - f32::from(count)).abs() < 0.02, "{count}: {}", tone(light));
+        }
+    }
 
     #[test]
     fn noise_has_the_asked_spread_and_no_bias() {

@@ -1,7 +1,7 @@
 //! What a run does unless told otherwise: what makes weights like the ones that ship, or what the paper did.
 
 use anyhow::Result;
-use storm_model::train::{Optimizer, Stage, TrainOptions};
+use storm_model::train::{LookOptions, Optimizer, Stage, TrainOptions};
 
 use crate::cmd::UsageError;
 
@@ -44,6 +44,10 @@ pub struct RecipeArgs {
     /// than the drives' [small: varied, paper: own].
     #[arg(long, value_parser = ["own", "varied"])]
     lenses: Option<String>,
+    /// What of the look of the drives' clips varies from clip to clip: plain (nothing), varied (everything), or some of sensor
+    /// with commas between them. Validation stays plain.
+    #[arg(long, default_value = "plain", value_parser = LookOptions::parse)]
+    looks: LookOptions,
     /// Strides that the anchor of half the drives' clips may lie before their first timestep, the clock beginning there, for
     /// weights that keep their accuracy where steps go on in an older frame (skip.reuse) [0: the paper's].
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=8))]
@@ -99,6 +103,7 @@ impl RecipeArgs {
         let structure_from = if small { steps * 2 / 3 } else { 5000 };
         options.render.structure_from_step = self.structure_from.unwrap_or(structure_from);
         options.clips.variety = self.lenses.as_deref().map_or(small, |l| l == "varied");
+        options.clips.looks = self.looks;
         options.clips.anchor_lead = self.anchor_lead;
         options.reuse = self.reuse.unwrap_or(if small { 2 } else { 1 });
         Ok(())
@@ -158,6 +163,13 @@ mod tests {
         assert_eq!((o.clips.targets, o.reuse, o.clips.variety, o.one_camera_steps), (4, 1, false, 0));
         let o = options("--recipe paper --optimizer muon --lenses varied --reuse 3", Start::New);
         assert_eq!((o.optimizer, o.clips.variety, o.reuse, o.stage), (Optimizer::Muon, true, 3, Stage::Render));
+    }
+
+    #[test]
+    fn looks_are_plain_until_asked_for() {
+        assert_eq!(options("", Start::New).clips.looks, LookOptions::default());
+        assert_eq!(options("--looks varied", Start::New).clips.looks, LookOptions::varied());
+        assert!(Line::try_parse_from(["train", "--looks", "wild"]).is_err());
     }
 
     #[test]
