@@ -103,6 +103,7 @@ fn clip(stored: &Stored) -> Result<ClipBatch, Box<dyn Error>> {
         intrinsics: stored["context_intrinsics"].clone(),
         world_from_camera: stored["context_camtoworlds"].clone(),
         time_sec: (&stored["context_time"] * 2.0)?,
+        valid: None,
         timespan_sec: 2.0,
         prior: None,
     })

@@ -63,6 +63,7 @@ fn window(c: &ModelConfig) -> Result<ClipBatch, Box<dyn Error>> {
                 world_from_camera: Affine3A::from_rotation_y(camera as f32 - 1.0)
                     * Affine3A::from_translation(Vec3::new(0.0, 0.0, t as f32)),
                 time_sec: 0.5 * t as f32,
+                valid: None,
             };
             (0..CAMERAS).map(view).collect()
         })

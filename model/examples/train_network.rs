@@ -28,6 +28,7 @@ fn clip(config: &ModelConfig, batch: usize, cameras: usize) -> Result<ClipBatch,
         intrinsics: Intrinsics::from_fov(70.0, width, height),
         world_from_camera: Affine3A::from_translation(0.4 * time as f32 * Vec3::X),
         time_sec: 0.5 * time as f32,
+        valid: None,
     };
     let views: Vec<Vec<ViewInput<'_>>> =
         (0..TIMESTEPS).map(|time| (0..cameras).map(|_| view(time)).collect()).collect();
@@ -38,6 +39,7 @@ fn clip(config: &ModelConfig, batch: usize, cameras: usize) -> Result<ClipBatch,
         intrinsics: repeat(&one.intrinsics)?,
         world_from_camera: repeat(&one.world_from_camera)?,
         time_sec: repeat(&one.time_sec)?,
+        valid: None,
         timespan_sec: one.timespan_sec,
         prior: None,
     })

@@ -21,6 +21,8 @@ pub struct ClipBatch {
     pub world_from_camera: Tensor,
     /// `(b, t, v)`, seconds since the window's first timestep.
     pub time_sec: Tensor,
+    /// `(b, t, v, h, w)`: 1 where the camera saw something, 0 where the picture only fills a gap; none: 1 everywhere.
+    pub valid: Option<Tensor>,
     /// Seconds that count as 1 in the time embedding (2.0 in the paper).
     pub timespan_sec: f64,
     /// An image shortly before each of `image`, of the same shape, for a velocity sweep; they are never tokens. None: there are none.
@@ -47,6 +49,8 @@ pub struct ViewInput<'a> {
     pub world_from_camera: Affine3A,
     /// Seconds since the window's first timestep.
     pub time_sec: f32,
+    /// Whether the camera saw the pixel, `width * height` of them, row by row; none: it saw all.
+    pub valid: Option<&'a [bool]>,
 }
 
 impl ClipBatch {
@@ -88,11 +92,20 @@ impl ClipBatch {
         let intrinsics: Vec<f32> = all().flat_map(|x| x.intrinsics.matrix().concat()).collect();
         let poses: Vec<f32> = all().flat_map(|x| pose_rows(&x.world_from_camera)).collect();
         let times: Vec<f32> = all().map(|x| x.time_sec).collect();
+        let valid = match all().any(|x| x.valid.is_some()) {
+            true => {
+                let seen = |x: &ViewInput<'_>, i: usize| f32::from(u8::from(x.valid.is_none_or(|valid| valid[i])));
+                let values: Vec<f32> = all().flat_map(|x| (0..width * height).map(move |i| seen(x, i))).collect();
+                Some(Tensor::from_vec(values, (1, t, v, height, width), device)?)
+            }
+            false => None,
+        };
         Ok(Self {
             image: Tensor::from_vec(image, (1, t, v, 3, height, width), device)?,
             intrinsics: Tensor::from_vec(intrinsics, (1, t, v, 3, 3), device)?,
             world_from_camera: Tensor::from_vec(poses, (1, t, v, 4, 4), device)?,
             time_sec: Tensor::from_vec(times, (1, t, v), device)?,
+            valid,
             timespan_sec,
             prior: None,
         })
@@ -105,6 +118,7 @@ impl ClipBatch {
             intrinsics: self.intrinsics.to_dtype(dtype)?,
             world_from_camera: self.world_from_camera.to_dtype(dtype)?,
             time_sec: self.time_sec.to_dtype(dtype)?,
+            valid: self.valid.as_ref().map(|x| x.to_dtype(dtype)).transpose()?,
             timespan_sec: self.timespan_sec,
             prior: self.map_prior(|prior| prior.to_dtype(dtype))?,
         })
@@ -127,6 +141,7 @@ impl ClipBatch {
             intrinsics: cat(|c| &c.intrinsics)?,
             world_from_camera: cat(|c| &c.world_from_camera)?,
             time_sec: cat(|c| &c.time_sec)?,
+            valid: cat_valid(clips.iter().map(|c| (c.valid.as_ref(), &c.image)), 0)?,
             timespan_sec: first.timespan_sec,
             prior: match clips.iter().map(|c| c.prior.as_deref().cloned()).collect::<Option<Vec<_>>>() {
                 Some(priors) => Some(Box::new(Self::stack(&priors)?)),
@@ -143,6 +158,7 @@ impl ClipBatch {
             intrinsics: self.intrinsics.narrow(0, index, 1)?,
             world_from_camera: self.world_from_camera.narrow(0, index, 1)?,
             time_sec: self.time_sec.narrow(0, index, 1)?,
+            valid: self.valid.as_ref().map(|x| x.narrow(0, index, 1)).transpose()?,
             timespan_sec: self.timespan_sec,
             prior: self.map_prior(|prior| prior.window(index))?,
         })
@@ -155,6 +171,7 @@ impl ClipBatch {
             intrinsics: self.intrinsics.narrow(1, t, 1)?,
             world_from_camera: self.world_from_camera.narrow(1, t, 1)?,
             time_sec: self.time_sec.narrow(1, t, 1)?,
+            valid: self.valid.as_ref().map(|x| x.narrow(1, t, 1)).transpose()?,
             timespan_sec: self.timespan_sec,
             prior: self.map_prior(|prior| prior.timestep(t))?,
         })
@@ -174,7 +191,8 @@ impl ClipBatch {
             ("world_from_camera", &self.world_from_camera, vec![b, t, v, 4, 4]),
             ("time_sec", &self.time_sec, vec![b, t, v]),
         ];
-        for (name, tensor, shape) in expected {
+        let valid = self.valid.as_ref().map(|x| ("valid", x, vec![b, t, v, h, w]));
+        for (name, tensor, shape) in expected.into_iter().chain(valid) {
             if tensor.dims() != shape {
                 return Err(ModelError::Input(format!("{name} has shape {:?}, expected {shape:?}", tensor.dims())));
             }
@@ -189,6 +207,23 @@ impl ClipBatch {
         }
         Ok([b, t, v, h, w])
     }
+}
+
+/// Validity masks one after the other along an axis, each beside a tensor `(b, t, v, ..)` of its windows and timesteps; a part
+/// without a mask is valid everywhere, and none is needed where no part has one.
+pub(crate) fn cat_valid<'a>(
+    parts: impl Iterator<Item = (Option<&'a Tensor>, &'a Tensor)> + Clone,
+    axis: usize,
+) -> candle_core::Result<Option<Tensor>> {
+    let Some((h, w)) = parts.clone().find_map(|(valid, _)| valid).map(|x| (x.dims()[3], x.dims()[4])) else {
+        return Ok(None);
+    };
+    let whole = |(valid, like): (Option<&Tensor>, &Tensor)| match valid {
+        Some(valid) => Ok(valid.clone()),
+        None => Tensor::ones((like.dim(0)?, like.dim(1)?, like.dim(2)?, h, w), like.dtype(), like.device()),
+    };
+    let all = parts.map(whole).collect::<candle_core::Result<Vec<_>>>()?;
+    Ok(Some(Tensor::cat(&all, axis)?))
 }
 
 fn check_counts(timesteps: usize, cameras: usize) -> Result<(), ModelError> {
@@ -216,6 +251,12 @@ fn check_view(
     }
     if view.rgb.len() != count {
         let text = format!("{place} has {} colour values, {}x{} pixels need {count}", view.rgb.len(), size[0], size[1]);
+        return Err(ModelError::Input(text));
+    }
+    if let Some(valid) = view.valid
+        && Some(valid.len()) != size[0].checked_mul(size[1])
+    {
+        let text = format!("{place} has {} marks of validity for {}x{} pixels", valid.len(), size[0], size[1]);
         return Err(ModelError::Input(text));
     }
     let pose = pose_rows(&view.world_from_camera);
@@ -257,7 +298,7 @@ mod tests {
     fn view(rgb: &[f32]) -> ViewInput<'_> {
         let intrinsics = Intrinsics { fx: 5.0, fy: 6.0, cx: 1.0, cy: 0.5, width: 2, height: 1 };
         let pose = Affine3A::from_rotation_translation(Quat::from_rotation_z(0.3), Vec3::new(1.0, 2.0, 3.0));
-        ViewInput { rgb, intrinsics, world_from_camera: pose, time_sec: 0.25 }
+        ViewInput { rgb, intrinsics, world_from_camera: pose, time_sec: 0.25, valid: None }
     }
 
     #[test]
@@ -271,7 +312,26 @@ mod tests {
         let m = flat(&a.world_from_camera);
         assert_eq!([m[3], m[7], m[11], m[15]], [1.0, 2.0, 3.0, 1.0]);
         assert!((m[0] - 0.3f32.cos()).abs() < 1e-6 && (m[1] + 0.3f32.sin()).abs() < 1e-6);
+        assert!(a.valid.is_none());
         assert_eq!(ClipBatch::stack(&[a, b]).unwrap().dims().unwrap(), [2, 1, 1, 1, 2]);
+    }
+
+    #[test]
+    fn a_mask_travels_with_its_pictures() {
+        let rgb = [0.1; 6];
+        let make = |valid| {
+            let views = [vec![view(&rgb)], vec![ViewInput { valid, ..view(&rgb) }]];
+            ClipBatch::from_views(&views, PixelLayout::Hwc, 2.0, &Device::Cpu)
+        };
+        let (masked, whole) = (make(Some(&[true, false])).unwrap(), make(None).unwrap());
+        let flat = |x: &ClipBatch| x.valid.as_ref().unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert_eq!(flat(&masked), [1.0, 1.0, 1.0, 0.0]);
+        assert_eq!(flat(&masked.timestep(1).unwrap()), [1.0, 0.0]);
+        let both = ClipBatch::stack(&[whole, masked]).unwrap();
+        assert_eq!(both.dims().unwrap(), [2, 2, 1, 1, 2]);
+        assert_eq!(flat(&both), [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0]);
+        assert_eq!(flat(&both.window(1).unwrap()), [1.0, 1.0, 1.0, 0.0]);
+        assert!(make(Some(&[true])).is_err());
     }
 
     #[test]

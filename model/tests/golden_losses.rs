@@ -37,6 +37,7 @@ fn check(case: &str, options: &RenderLossOptions, terms: &[(&str, &str)]) {
         image: stored["target.target_image"].clone(),
         depth: Some(stored["target.target_depth"].clone()),
         sky: Some(stored["target.target_sky_masks"].clone()),
+        valid: None,
     };
     let found = render_losses(&rendered, &target, &[vars[3].as_tensor()], options, 0).unwrap();
     let by_name: HashMap<_, _> = found.values().unwrap().into_iter().collect();

@@ -51,6 +51,7 @@ fn clip(t: usize, v: usize, height: usize, width: usize) -> ClipBatch {
         intrinsics: intrinsics(height, width),
         world_from_camera: pose(ti, vi),
         time_sec: 0.5 * ti as f32,
+        valid: None,
     };
     let views: Vec<Vec<ViewInput<'_>>> = (0..t).map(|ti| (0..v).map(|vi| view(ti, vi)).collect()).collect();
     ClipBatch::from_views(&views, PixelLayout::Hwc, 2.0, &Device::Cpu).unwrap()

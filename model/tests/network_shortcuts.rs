@@ -43,6 +43,7 @@ fn clip_of(seed: usize, timesteps: std::ops::Range<usize>) -> ClipBatch {
                 world_from_camera: Affine3A::from_rotation_y(c as f32)
                     * Affine3A::from_translation(Vec3::new(0.0, 0.0, t as f32)),
                 time_sec: 0.5 * t as f32,
+                valid: None,
             };
             (0..CAMERAS).map(view).collect()
         })

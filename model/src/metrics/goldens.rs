@@ -130,6 +130,7 @@ impl Loaded {
             depth: Some((&self.pred_depth, &self.truth_depth)),
             sky: Some(&self.sky),
             dynamic: Some(&self.dynamic),
+            valid: None,
         }
     }
 }

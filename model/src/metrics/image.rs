@@ -181,6 +181,8 @@ pub struct Held<'a> {
     pub sky: Option<&'a [bool]>,
     /// Pixels of moving things.
     pub dynamic: Option<&'a [bool]>,
+    /// Pixels the camera saw; others count in no figure, nor do SSIM's windows that reach one. `None`: it saw all.
+    pub valid: Option<&'a [bool]>,
 }
 
 /// The figures of one image, or means of such figures over images that have them.
@@ -210,16 +212,50 @@ pub struct ImageScores {
 /// procedural drive goes on to the horizon.
 pub const LIDAR_REACH_M: f32 = 75.0;
 
+/// Pixels in both regions, none being all.
+fn both(a: Option<&[bool]>, b: Option<&[bool]>) -> Option<Vec<bool>> {
+    match (a, b) {
+        (Some(a), Some(b)) => Some(a.iter().zip(b).map(|(a, b)| *a && *b).collect()),
+        (one, other) => one.or(other).map(<[bool]>::to_vec),
+    }
+}
+
+/// Pixels that are no border of SSIM's window.
+fn inside(image: &Image<'_>) -> Vec<bool> {
+    let (w, h) = (image.width, image.height);
+    let off_border = |i: usize, len: usize| i >= BORDER && i + BORDER < len;
+    (0..w * h).map(|i| off_border(i % w, w) && off_border(i / w, h)).collect()
+}
+
+/// Pixels around which SSIM's window holds valid ones alone (the image's edges are none).
+fn whole_windows(valid: &[bool], image: &Image<'_>) -> Vec<bool> {
+    let (w, h) = (image.width, image.height);
+    let near = |x: usize, len: usize| x.saturating_sub(BORDER)..(x + BORDER + 1).min(len);
+    let rows: Vec<bool> = (0..w * h).map(|i| near(i % w, w).all(|c| valid[i / w * w + c])).collect();
+    (0..w * h).map(|i| near(i / w, h).all(|r| rows[r * w + i % w])).collect()
+}
+
 impl Held<'_> {
     /// All figures of this image. Regions that were not given have none.
     pub fn scores(&self) -> Result<ImageScores, MetricError> {
         let map = ssim_map(&self.pred, &self.truth)?;
+        check_mask(self.valid, self.truth.pixels())?;
+        let whole = self.valid.map(|valid| whole_windows(valid, &self.truth));
         let occupied = self.sky.map(|sky| sky.iter().map(|s| !s).collect::<Vec<bool>>());
         let picture = |mask: Option<&[bool]>| -> Result<(Option<f64>, Option<f64>), MetricError> {
-            Ok((psnr(&self.pred, &self.truth, mask)?, mean_ssim(&map, &self.truth, mask)))
+            let seen = both(self.valid, mask);
+            // A whole image's SSIM leaves out its border too.
+            let inner = whole.as_ref().map(|whole| match mask {
+                Some(_) => both(Some(whole), mask),
+                None => both(Some(whole), Some(&inside(&self.truth))),
+            });
+            let ssim = mean_ssim(&map, &self.truth, inner.map_or(mask.map(<[bool]>::to_vec), |m| m).as_deref());
+            Ok((psnr(&self.pred, &self.truth, seen.as_deref())?, ssim))
         };
         let region = |mask: Option<&[bool]>| mask.map_or(Ok((None, None)), |mask| picture(Some(mask)));
-        let depth = |mask: Option<&[bool]>| self.depth.map_or(Ok(None), |(p, t)| depth_rmse(p, t, mask));
+        let depth = |mask: Option<&[bool]>| {
+            self.depth.map_or(Ok(None), |(p, t)| depth_rmse(p, t, both(self.valid, mask).as_deref()))
+        };
         let (psnr, ssim) = picture(None)?;
         let (psnr_occupied, ssim_occupied) = region(occupied.as_deref())?;
         let (psnr_dynamic, ssim_dynamic) = region(self.dynamic)?;
@@ -306,6 +342,34 @@ mod tests {
         let none = Image { width: 0, height: 0, channels: 3, values: &[] };
         assert_eq!(ssim(&none, &none, None).unwrap(), None);
         assert_eq!(psnr(&none, &none, None).unwrap(), None);
+    }
+
+    #[test]
+    fn what_the_camera_did_not_see_counts_in_no_figure() {
+        let (w, h) = (20, 16);
+        let seen: Vec<f32> = (0..w * h * 3).map(|i| (i % 17) as f32 / 17.0).collect();
+        let valid: Vec<bool> = (0..w * h).map(|i| i / w >= 5).collect();
+        let sky: Vec<bool> = (0..w * h).map(|i| i % w < 6).collect();
+        let depth = vec![5.0; w * h];
+        let scores = |unseen: f32, valid: Option<&[bool]>| {
+            let mut drawn: Vec<f32> = seen.iter().map(|x| x * 0.9).collect();
+            let mut far = vec![6.0; w * h];
+            drawn[..5 * w * 3].fill(unseen);
+            far[..5 * w].fill(unseen);
+            let held = Held {
+                pred: image(&drawn, w, 3),
+                truth: image(&seen, w, 3),
+                depth: Some((&far, &depth)),
+                sky: Some(&sky),
+                dynamic: Some(&sky),
+                valid,
+            };
+            held.scores().unwrap()
+        };
+        assert_eq!(scores(0.0, Some(&valid)), scores(1.0, Some(&valid)));
+        assert_eq!(scores(0.0, Some(&valid)).depth_rmse, Some(1.0));
+        assert_ne!(scores(0.0, None), scores(1.0, None));
+        assert_eq!(scores(0.3, None), scores(0.3, Some(&vec![true; w * h])));
     }
 
     #[test]

@@ -14,6 +14,7 @@ pub(crate) mod sweep;
 mod tokens;
 mod transformer;
 mod upsample;
+mod validity;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -145,6 +146,8 @@ impl Storm {
         let (rows, cols) = (h / config.patch_size, w / config.patch_size);
         let grid = Grid { timesteps, cameras: v, rows, cols };
         shortcuts.check(grid.patches())?;
+        let with_mask = validity::without_unseen(shortcuts, batch, grid, config.patch_size)?;
+        let shortcuts = with_mask.as_ref().unwrap_or(shortcuts);
         let rays = Rays::new(config, batch)?;
         stages.keep("ray_directions", &rays.directions);
         stages.keep("plucker", &rays.plucker);
@@ -188,9 +191,12 @@ impl Storm {
         let config = &*self.config;
         let [b, _, v, h, w] = batch.dims()?;
         let (rows, cols) = (h / config.patch_size, w / config.patch_size);
-        let (image, time_sec, rays) = match newest {
-            Some(t) => (batch.image.narrow(1, t, 1)?, batch.time_sec.narrow(1, t, 1)?, rays.timestep(t)?),
-            None => (batch.image.clone(), batch.time_sec.clone(), rays),
+        let (image, time_sec, valid, rays) = match newest {
+            Some(t) => {
+                let valid = batch.valid.as_ref().map(|x| x.narrow(1, t, 1)).transpose()?;
+                (batch.image.narrow(1, t, 1)?, batch.time_sec.narrow(1, t, 1)?, valid, rays.timestep(t)?)
+            }
+            None => (batch.image.clone(), batch.time_sec.clone(), batch.valid.clone(), rays),
         };
         let dims = [b, image.dim(1)?, v, h, w];
         let (mut at, d) = (0, config.embed_dim);
@@ -209,7 +215,7 @@ impl Storm {
 
         let gaussians = self.gaussians.forward(config, &image_tokens, &image, &rays, stages)?;
         let motion = self.motion.forward(config, &image_tokens, motion_tokens.as_ref(), dims, stages)?;
-        Ok(ClipOutput {
+        let mut output = ClipOutput {
             means: gaussians.means,
             scales: gaussians.scales,
             quats: gaussians.quats,
@@ -224,9 +230,14 @@ impl Storm {
             affine,
             sky_token,
             time_sec,
+            valid: valid.clone(),
             config: Arc::clone(&self.config),
             sky: self.sky.clone(),
-        })
+        };
+        if let Some(valid) = &valid {
+            output.show_only(valid)?;
+        }
+        Ok(output)
     }
 
     /// The position embedding on a patch grid, `(1, rows * cols, embed_dim)`; none when the network has none.

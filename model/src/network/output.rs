@@ -8,6 +8,7 @@ use storm_render::Gaussians;
 
 use super::sky::SkyHead;
 use super::tokens::Grid;
+use crate::clip::cat_valid;
 use crate::config::{AffineKind, ModelConfig};
 use crate::error::ModelError;
 use crate::kernels::tensors::with_values;
@@ -44,6 +45,9 @@ pub struct ClipOutput {
     pub sky_token: Option<Tensor>,
     /// `(b, t, v)` seconds, as given.
     pub time_sec: Tensor,
+    /// `(b, t, v, h, w)`: 0 where the camera saw nothing, so that there is no Gaussian (opacity and velocity are 0 there), else
+    /// 1; none: 1 everywhere.
+    pub valid: Option<Tensor>,
     /// The network's configuration.
     pub config: Arc<ModelConfig>,
     pub(super) sky: Option<Arc<SkyHead>>,
@@ -87,6 +91,7 @@ impl ClipOutput {
             velocity_forward: part(&self.velocity_forward)?,
             motion_weights: self.motion_weights.as_ref().map(part).transpose()?,
             time_sec: part(&self.time_sec)?,
+            valid: self.valid.as_ref().map(part).transpose()?,
             ..self.clone()
         })
     }
@@ -111,6 +116,7 @@ impl ClipOutput {
             velocity_forward: cat(|o| &o.velocity_forward)?,
             motion_weights: weights.map(|all| Tensor::cat(&all, axis)).transpose()?,
             time_sec: cat(|o| &o.time_sec)?,
+            valid: cat_valid(each.iter().map(|o| (o.valid.as_ref(), &o.opacities)), axis)?,
             ..self.clone()
         })
     }
@@ -152,8 +158,12 @@ impl ClipOutput {
                 if keep.get(patch).copied().unwrap_or(true) { 1.0 } else { 0.0 }
             })
             .collect();
-        let mask =
-            Tensor::from_vec(pixels, (1, t, v, h, w), self.opacities.device())?.to_dtype(self.opacities.dtype())?;
+        self.show_only(&Tensor::from_vec(pixels, (1, t, v, h, w), self.opacities.device())?)
+    }
+
+    /// Makes what `shown` `(b or 1, t, v, h, w)` has a 0 for transparent and still.
+    pub(super) fn show_only(&mut self, shown: &Tensor) -> Result<(), ModelError> {
+        let mask = shown.to_dtype(self.opacities.dtype())?;
         self.opacities = self.opacities.broadcast_mul(&mask)?;
         let mask = mask.unsqueeze(D::Minus1)?;
         self.velocity_backward = self.velocity_backward.broadcast_mul(&mask)?;
@@ -209,10 +219,15 @@ impl ClipOutput {
             Some(bases) => read("motion_bases", bases)?.chunks(bases.dim(2)?).map(<[f32]>::to_vec).collect(),
             None => Vec::new(),
         };
+        let valid = match &self.valid {
+            Some(valid) => read("valid", valid)?.into_iter().map(|x| x > 0.5).collect(),
+            None => Vec::new(),
+        };
         Ok(Scene {
             gaussians,
             shape: SceneShape { timesteps: t, cameras: v, height: h, width: w },
             depths: read("depths", &self.depths)?,
+            valid,
             sky,
             affine,
             motion_bases,

@@ -57,6 +57,8 @@ pub struct Scene {
     pub shape: SceneShape,
     /// Depth per Gaussian, metres; what it measures is `config.depth_meaning`.
     pub depths: Vec<f32>,
+    /// Whether the camera saw the pixel each came from; what it did not see has opacity 0 and is no sky. Empty: it saw all.
+    pub valid: Vec<bool>,
     /// The sky; none without a sky token.
     pub sky: Option<SkyModel>,
     /// Exposure per camera of the window; empty without affine tokens.
@@ -65,4 +67,11 @@ pub struct Scene {
     pub motion_bases: Vec<Vec<f32>>,
     /// The configuration of the network that made it.
     pub config: Arc<ModelConfig>,
+}
+
+impl Scene {
+    /// Whether the camera saw the pixel that Gaussian `i` came from.
+    pub fn is_valid(&self, i: usize) -> bool {
+        self.valid.get(i).copied().unwrap_or(true)
+    }
 }

@@ -265,6 +265,7 @@ impl ClipPlan {
                 intrinsics,
                 anchor_from_camera: affine32(&(*anchor_from_map * opens)),
                 time_sec: (self.lead_sec + time_sec) as f32,
+                valid: None,
             })
         };
         times.iter().map(|&t| (0..drive.cameras().len()).map(|c| shot(c, t)).collect()).collect()
@@ -277,6 +278,8 @@ pub(super) struct Shot {
     pub intrinsics: Intrinsics,
     pub anchor_from_camera: Affine3A,
     pub time_sec: f32,
+    /// Pixels the camera saw; none: all.
+    pub valid: Option<Vec<bool>>,
 }
 
 impl Shot {
@@ -298,6 +301,7 @@ impl Shot {
                         intrinsics: shot.intrinsics,
                         world_from_camera: shot.anchor_from_camera,
                         time_sec: shot.time_sec,
+                        valid: shot.valid.as_deref(),
                     })
                     .collect()
             })
@@ -356,6 +360,7 @@ fn map_clip(clip: &ClipBatch, to: &impl Fn(&Tensor) -> candle_core::Result<Tenso
         intrinsics: to(&clip.intrinsics)?,
         world_from_camera: to(&clip.world_from_camera)?,
         time_sec: to(&clip.time_sec)?,
+        valid: clip.valid.as_ref().map(to).transpose()?,
         timespan_sec: clip.timespan_sec,
         prior: match &clip.prior {
             Some(prior) => Some(Box::new(map_clip(prior, to)?)),

@@ -40,13 +40,15 @@ pub fn held_pictures<'a>(
         let scene = model.forward(&clip.to_device(device)?.context)?.scene(0)?;
         add_psnr(&scene, target, &mut raster, &mut ours)?;
         let (context, wanted) = (images(&clip.context)?, images(target)?);
+        let valid = validity(target)?;
         let (context_sec, target_sec) = (numbers(&clip.context.time_sec)?, numbers(&target.time_sec)?);
         let cameras = scene.shape.cameras;
         for (k, want) in wanted.iter().enumerate() {
             let same_camera = (0..context.len()).filter(|i| i % cameras == k % cameras);
             let away = |i: &usize| (context_sec[*i] - target_sec[k]).abs();
             let Some(near) = same_camera.min_by(|a, b| away(a).total_cmp(&away(b))) else { continue };
-            nearest.add(psnr(&image(&context[near], &scene), &image(want, &scene), None).map_err(metric)?);
+            let valid = valid.get(k).map(Vec::as_slice);
+            nearest.add(psnr(&image(&context[near], &scene), &image(want, &scene), valid).map_err(metric)?);
             pictures += 1;
         }
     }
@@ -61,7 +63,7 @@ pub(super) fn add_psnr(
     mean: &mut Mean,
 ) -> Result<(), TrainError> {
     let (pictures, times) = (images(target)?, numbers(&target.time_sec)?);
-    let views = views(target)?;
+    let (views, valid) = (views(target)?, validity(target)?);
     let cameras = scene.shape.cameras;
     for (t, row) in views.chunks(cameras).enumerate() {
         let targets: Vec<(View, Option<usize>)> = row.iter().enumerate().map(|(c, v)| (*v, Some(c))).collect();
@@ -69,7 +71,8 @@ pub(super) fn add_psnr(
         for (c, view) in drawn.iter().enumerate() {
             let got: Vec<f32> = view.color.iter().flatten().map(|&x| unit_from_signed(x)).collect();
             let want = &pictures[t * cameras + c];
-            mean.add(psnr(&image(&got, scene), &image(want, scene), None).map_err(metric)?);
+            let valid = valid.get(t * cameras + c).map(Vec::as_slice);
+            mean.add(psnr(&image(&got, scene), &image(want, scene), valid).map_err(metric)?);
         }
     }
     Ok(())
@@ -81,6 +84,13 @@ fn images(clip: &ClipBatch) -> Result<Vec<Vec<f32>>, TrainError> {
     let (values, size) = (numbers(&clip.image)?, height * width);
     let unit = |picture: &[f32]| (0..3 * size).map(|i| unit_from_signed(picture[(i % 3) * size + i / 3])).collect();
     Ok(values.chunks_exact(3 * size).map(unit).collect())
+}
+
+/// Pixels each of those pictures' cameras saw; empty: all.
+fn validity(clip: &ClipBatch) -> Result<Vec<Vec<bool>>, TrainError> {
+    let [_, _, _, height, width] = clip.dims()?;
+    let Some(valid) = &clip.valid else { return Ok(Vec::new()) };
+    Ok(numbers(valid)?.chunks_exact(height * width).map(|x| x.iter().map(|x| *x > 0.5).collect()).collect())
 }
 
 fn image<'a>(values: &'a [f32], scene: &Scene) -> Image<'a> {

@@ -63,6 +63,8 @@ pub struct Target {
     pub depth: Option<Tensor>,
     /// `(b, t, v, h, w)`, 1 in the sky; `None` without sky masks.
     pub sky: Option<Tensor>,
+    /// `(b, t, v, h, w)`, 1 where the camera saw something: colours count there alone. `None`: everywhere.
+    pub valid: Option<Tensor>,
 }
 
 /// Named loss terms, weights applied.
@@ -111,7 +113,7 @@ pub fn render_losses(
 ) -> Result<Terms, ModelError> {
     let mut terms = Terms::default();
     let image = channel_last(&target.image)?;
-    terms.push("rgb", color_loss(&rendered.image, &image)?);
+    terms.push("rgb", color_loss_where(&rendered.image, &image, target.valid.as_ref())?);
     if let Some(depth) = &target.depth
         && options.depth > 0.0
         && let Some(loss) = depth_loss(&rendered.depth, depth)?
@@ -119,7 +121,10 @@ pub fn render_losses(
         terms.push("depth", (loss * options.depth)?);
     }
     if options.structure > 0.0 && step >= options.structure_from_step {
-        terms.push("structure", (structure_loss(&rendered.image, &image)? * options.structure)?);
+        terms.push(
+            "structure",
+            (structure_loss(&or_truth(&rendered.image, &image, target.valid.as_ref())?, &image)? * options.structure)?,
+        );
     }
     if options.velocity > 0.0 {
         terms.push("velocity", velocity_loss(velocities, options.velocity)?);
@@ -140,6 +145,14 @@ pub fn render_losses(
     Ok(terms)
 }
 
+/// The drawn picture `(b, t, v, h, w, 3)` with the camera's own colours where it saw nothing: no term that compares
+/// neighbourhoods finds a difference there, and no gradient goes there.
+pub fn or_truth(drawn: &Tensor, truth: &Tensor, valid: Option<&Tensor>) -> candle_core::Result<Tensor> {
+    let Some(valid) = valid else { return Ok(drawn.clone()) };
+    let valid = valid.to_dtype(drawn.dtype())?.unsqueeze(D::Minus1)?;
+    drawn.broadcast_mul(&valid)? + truth.broadcast_mul(&valid.affine(-1.0, 1.0)?)?
+}
+
 /// `(b, t, v, 3, h, w)` to `(b, t, v, h, w, 3)`.
 pub fn channel_last(image: &Tensor) -> candle_core::Result<Tensor> {
     image.permute((0, 1, 2, 4, 5, 3))?.contiguous()
@@ -148,6 +161,17 @@ pub fn channel_last(image: &Tensor) -> candle_core::Result<Tensor> {
 /// Mean squared error of colours in 0..1, from the network range -1..1.
 pub fn color_loss(pred: &Tensor, truth: &Tensor) -> candle_core::Result<Tensor> {
     (pred.affine(0.5, 0.5)? - truth.affine(0.5, 0.5)?)?.sqr()?.mean_all()
+}
+
+/// As [`color_loss`] over the pixels that `valid` `(b, t, v, h, w)` has a 1 for; none: over all. 0 where there is no such pixel.
+pub fn color_loss_where(pred: &Tensor, truth: &Tensor, valid: Option<&Tensor>) -> candle_core::Result<Tensor> {
+    let Some(valid) = valid else { return color_loss(pred, truth) };
+    let error = (pred.affine(0.5, 0.5)? - truth.affine(0.5, 0.5)?)?.sqr()?.mean(D::Minus1)?;
+    let valid = valid.to_dtype(error.dtype())?;
+    match masked_mean(&error, &valid)? {
+        Some(loss) => Ok(loss),
+        None => (error * valid)?.sum_all(),
+    }
 }
 
 /// Mean absolute depth error over the known pixels, over the largest known depth of the batch; `None` where none is known.

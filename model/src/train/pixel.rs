@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::bases::bases_loss;
 use super::clips::TrainClip;
 use super::groups::group_loss;
-use super::losses::{Terms, channel_last, color_loss, depth_loss, masked_mean, velocity_loss};
+use super::losses::{Terms, channel_last, color_loss_where, depth_loss, masked_mean, velocity_loss};
 use crate::config::VelocityKind;
 use crate::error::ModelError;
 use crate::network::ClipOutput;
@@ -96,7 +96,8 @@ pub fn pixel_losses(output: &ClipOutput, clip: &TrainClip, options: &PixelLossOp
     }
     if options.color > 0.0 {
         let exposed = exposed(output, &output.colors)?;
-        add("color", options.color, Some(color_loss(&exposed, &channel_last(&clip.context.image)?)?))?;
+        let seen = channel_last(&clip.context.image)?;
+        add("color", options.color, Some(color_loss_where(&exposed, &seen, clip.context.valid.as_ref())?))?;
     }
     if options.opacity > 0.0 {
         // The probability given to what is there.

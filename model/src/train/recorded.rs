@@ -38,6 +38,8 @@ pub struct RecordedPicture<'a> {
     pub depth: Option<&'a [f32]>,
     /// Sky or not; `None`: unknown everywhere.
     pub sky: Option<&'a [SkyLabel]>,
+    /// Whether the camera saw the pixel; nothing is learned from others. `None`: it saw all.
+    pub valid: Option<&'a [bool]>,
 }
 
 impl RecordedPicture<'_> {
@@ -53,7 +55,10 @@ impl RecordedPicture<'_> {
         match (self.depth, self.sky) {
             (Some(depth), _) if depth.len() != pixels => wrong("depths", depth.len()),
             (_, Some(sky)) if sky.len() != pixels => wrong("sky labels", sky.len()),
-            _ => Ok(()),
+            _ => match self.valid {
+                Some(valid) if valid.len() != pixels => wrong("marks of validity", valid.len()),
+                _ => Ok(()),
+            },
         }
     }
 
@@ -61,19 +66,17 @@ impl RecordedPicture<'_> {
     fn shot(&self) -> Shot {
         let Intrinsics { width, height, .. } = self.intrinsics;
         let pixels = width * height;
-        // A depth that is no number, negative or infinite is no depth.
-        let depth = |&z: &f32| if z > 0.0 && z.is_finite() { z } else { 0.0 };
+        // A depth that is no number, negative or infinite is no depth, and neither is one of a pixel nobody saw.
+        let depth = |(i, &z): (usize, &f32)| if z > 0.0 && z.is_finite() && self.is_valid(i) { z } else { 0.0 };
+        let sky = |(i, &l): (usize, &SkyLabel)| u8::from(l == SkyLabel::Sky && self.is_valid(i));
         let frame = WorldFrame {
             width,
             height,
             rgb: self.rgb.to_vec(),
-            depth: self.depth.map_or_else(|| vec![0.0; pixels], |d| d.iter().map(depth).collect()),
+            depth: self.depth.map_or_else(|| vec![0.0; pixels], |d| d.iter().enumerate().map(depth).collect()),
             flow: vec![[0.0; 3]; pixels],
             instance: vec![0; pixels],
-            sky: self.sky.map_or_else(
-                || vec![0; pixels],
-                |labels| labels.iter().map(|&l| u8::from(l == SkyLabel::Sky)).collect(),
-            ),
+            sky: self.sky.map_or_else(|| vec![0; pixels], |labels| labels.iter().enumerate().map(sky).collect()),
             moving: vec![0; pixels],
         };
         Shot {
@@ -81,14 +84,22 @@ impl RecordedPicture<'_> {
             intrinsics: self.intrinsics,
             anchor_from_camera: self.anchor_from_camera,
             time_sec: self.time_sec,
+            valid: self.valid.map(<[bool]>::to_vec),
         }
+    }
+
+    fn is_valid(&self, i: usize) -> bool {
+        self.valid.is_none_or(|valid| valid[i])
     }
 
     /// 1 where the sky label holds.
     fn sky_known(&self) -> Vec<f32> {
         let pixels = self.intrinsics.width * self.intrinsics.height;
         match self.sky {
-            Some(labels) => labels.iter().map(|&l| if l == SkyLabel::Unknown { 0.0 } else { 1.0 }).collect(),
+            Some(labels) => {
+                let known = |(i, &l): (usize, &SkyLabel)| l != SkyLabel::Unknown && self.is_valid(i);
+                labels.iter().enumerate().map(|x| f32::from(u8::from(known(x)))).collect()
+            }
             None => vec![0.0; pixels],
         }
     }
@@ -163,6 +174,7 @@ mod tests {
             time_sec,
             depth,
             sky,
+            valid: None,
         };
         let rows = |times: &[f32]| times.iter().map(|&t| vec![picture(t)]).collect::<Vec<_>>();
         recorded_clip(&rows(&[0.0, 0.5]), &rows(&[0.2]), 2.0, &config()).unwrap()
@@ -212,6 +224,71 @@ mod tests {
     }
 
     #[test]
+    fn pixels_nobody_saw_teach_nothing() {
+        let pixels = SIZE.0 * SIZE.1;
+        // The upper third is one patch row that nobody saw; a few pixels more below it.
+        let valid: Vec<bool> = (0..pixels).map(|i| i >= SIZE.0 * 8 + 5).collect();
+        let config = config();
+        let intrinsics = Intrinsics { fx: 12.0, fy: 12.0, cx: 12.0, cy: 8.0, width: SIZE.0, height: SIZE.1 };
+        let depth = vec![9.0; pixels];
+        let sky = vec![SkyLabel::Sky; pixels];
+        let make = |unseen: u8| {
+            let colour = |i: usize| if valid[i / 3] { (i * 37 % 251) as u8 } else { unseen };
+            let rgb: Vec<u8> = (0..3 * pixels).map(colour).collect();
+            let picture = |time_sec: f32| RecordedPicture {
+                rgb: &rgb,
+                intrinsics,
+                anchor_from_camera: Affine3A::from_translation(glam::Vec3::Z * time_sec),
+                time_sec,
+                depth: Some(&depth),
+                sky: Some(&sky),
+                valid: Some(&valid),
+            };
+            let rows = |times: &[f32]| times.iter().map(|&t| vec![picture(t)]).collect::<Vec<_>>();
+            recorded_clip(&rows(&[0.0, 0.5]), &rows(&[0.2]), 2.0, &config).unwrap()
+        };
+        let clip = make(0);
+        let count = |x: &Tensor| x.sum_all().unwrap().to_scalar::<f32>().unwrap();
+        let seen = valid.iter().filter(|v| **v).count() as f32;
+        assert_eq!(count(&clip.context_truth.measured().unwrap()), 2.0 * seen);
+        assert_eq!(count(&clip.context_truth.sky_known), 2.0 * seen);
+        // Drawn pictures: what stands in unseen pixels of the target changes no term.
+        let storm = Storm::untrained(&config, 2, &Device::Cpu).unwrap();
+        let output = storm.forward(&clip.context).unwrap();
+        let renderer: SharedRenderer = Arc::new(Mutex::new(CpuRasterizer::new(config.raster_settings()).unwrap()));
+        let options = RenderLossOptions { structure_from_step: 0, ..RenderLossOptions::default() };
+        let render = |clip: &TrainClip| {
+            render_stage_losses(&output, clip, &renderer, &options, None, 0).unwrap().values().unwrap()
+        };
+        let pixel =
+            |clip: &TrainClip| pixel_losses(&output, clip, &PixelLossOptions::default()).unwrap().values().unwrap();
+        assert_eq!(render(&clip), render(&make(200)));
+        assert_eq!(pixel(&clip), pixel(&make(200)));
+        let unmarked = TrainClip {
+            target: clip.target.clone().map(|(c, t)| (crate::ClipBatch { valid: None, ..c }, t)),
+            ..clip.clone()
+        };
+        assert_ne!(render(&clip), render(&unmarked));
+        assert!(
+            recorded_clip(
+                &[vec![RecordedPicture {
+                    rgb: &vec![0; 3 * pixels],
+                    intrinsics,
+                    anchor_from_camera: Affine3A::IDENTITY,
+                    time_sec: 0.0,
+                    depth: None,
+                    sky: None,
+                    valid: Some(&[true]),
+                }]],
+                &[],
+                2.0,
+                &config
+            )
+            .is_err()
+        );
+    }
+
+    #[test]
     fn pictures_that_do_not_fit_their_size_are_refused() {
         let rgb = vec![0; 3 * SIZE.0 * SIZE.1];
         let intrinsics = Intrinsics { fx: 12.0, fy: 12.0, cx: 12.0, cy: 8.0, width: SIZE.0, height: SIZE.1 };
@@ -222,6 +299,7 @@ mod tests {
             time_sec: 0.0,
             depth: None,
             sky: None,
+            valid: None,
         };
         let make = |picture: RecordedPicture<'_>| recorded_clip(&[vec![picture]], &[], 2.0, &config());
         make(good).unwrap();

@@ -4,7 +4,7 @@ use candle_core::{D, Tensor};
 use storm_render::View;
 
 use super::clips::TrainClip;
-use super::losses::{RenderLossOptions, Rendered, Target, Terms, channel_last, masked_mean, render_losses};
+use super::losses::{RenderLossOptions, Rendered, Target, Terms, channel_last, masked_mean, or_truth, render_losses};
 use super::lpips::FeatureNetwork;
 use super::pixel::velocities;
 use super::raster::{DRAWN, SharedRenderer, draw};
@@ -35,7 +35,8 @@ pub fn render_stage_losses(
     let depth = (options.depth > 0.0).then(|| depth.clone());
     let labelled = truth.sky_labelled()?;
     let whole = labelled == 1.0;
-    let target = Target { image: target.image.clone(), depth, sky: whole.then(|| sky.clone()) };
+    let target =
+        Target { image: target.image.clone(), depth, sky: whole.then(|| sky.clone()), valid: target.valid.clone() };
     // The stand-in makes way for a feature network.
     let structure = if features.is_some() { 0.0 } else { options.structure };
     let stood_in = RenderLossOptions { structure, ..*options };
@@ -44,7 +45,8 @@ pub fn render_stage_losses(
         && options.structure > 0.0
         && step >= options.structure_from_step
     {
-        let distance = features.distance(&rendered.image, &channel_last(&target.image)?)?;
+        let seen = channel_last(&target.image)?;
+        let distance = features.distance(&or_truth(&rendered.image, &seen, target.valid.as_ref())?, &seen)?;
         terms.push("lpips", (distance * options.structure)?);
     }
     if labelled > 0.0 && !whole && options.sky_opacity > 0.0 {

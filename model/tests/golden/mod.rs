@@ -39,6 +39,7 @@ pub fn clip(inputs: &Goldens) -> ClipBatch {
         intrinsics: inputs["context_intrinsics"].clone(),
         world_from_camera: inputs["context_camtoworlds"].clone(),
         time_sec: (&inputs["context_time"] * f64::from(timespan)).unwrap(),
+        valid: None,
         timespan_sec: f64::from(timespan),
         prior: None,
     }

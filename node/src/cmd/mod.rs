@@ -25,6 +25,7 @@ use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
 use crate::config::ConfigError;
+use crate::source::RigError;
 
 /// How a command ended; the exit codes are part of the program's contract.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -130,7 +131,8 @@ impl Cli {
         };
         result.unwrap_or_else(|e| {
             complain!("error: {e:#}");
-            let usage = e.chain().any(|c| c.is::<ConfigError>() || c.is::<UsageError>());
+            let of_masks = |c: &(dyn std::error::Error + 'static)| matches!(c.downcast_ref(), Some(RigError::Mask(_)));
+            let usage = e.chain().any(|c| c.is::<ConfigError>() || c.is::<UsageError>() || of_masks(c));
             if usage { Outcome::Usage } else { Outcome::Input }
         })
     }

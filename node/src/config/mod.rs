@@ -37,6 +37,10 @@ section! {
         image_time_offset_sec: Vec<f64> = Vec::new(),
         /// Whether images are rectified already: `auto` (the topic name says so), `yes`, `no`.
         rectified: String = "auto".into(),
+        /// Parts of images to ignore, such as the vehicle's own bonnet: entries `CAMERA=FILE` with the camera's number or image topic and a picture of any size, black where to ignore.
+        masks: Vec<String> = Vec::new(),
+        /// Whether a constant black frame around a camera's images (left by a driver's own rectification, or around a fisheye's circle) is looked for and left out.
+        find_black_frame: bool = true,
         /// Topics below this prefix are ground truth: never input, used for scoring.
         truth_prefix: String = "/ground_truth".into(),
     }

@@ -103,6 +103,12 @@ impl Config {
         one_of("model.precision", &self.model.precision, &Precision::ALL.map(|(_, name)| name))?;
         between("model.sweep_prior_sec", self.model.sweep_prior_sec, 0.0, 1.0)?;
         one_of("model.device", &self.model.device, &["cpu", "cuda", "metal"])?;
+        for entry in &self.input.masks {
+            if crate::source::masks::parse(entry).is_err() {
+                let expected = "wants CAMERA=FILE, with the camera's number or image topic".to_owned();
+                return Err(ConfigError::Value { key: "input.masks", value: format!("`{entry}`"), expected });
+            }
+        }
         for x in &self.input.image_time_offset_sec {
             between("input.image_time_offset_sec", *x, -60.0, 60.0)?;
         }

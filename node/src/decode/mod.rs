@@ -5,6 +5,7 @@
 //! [`Encoding`] and [`Format`] are the tables of what can be read, and say what is colour.
 
 mod bayer;
+mod black_frame;
 mod color;
 mod compressed;
 mod compressed_depth;
@@ -18,9 +19,11 @@ mod packed;
 mod rectify;
 mod resample;
 mod rows;
+mod validity;
 mod warp;
 mod yuv;
 
+pub use black_frame::{BlackFrame, FrameFinder};
 pub use color::image_to_rgb;
 pub use compressed::{compressed_of_size, compressed_to_rgb};
 pub use compressed_depth::compressed_to_depth;
@@ -30,6 +33,7 @@ pub use format::{Codec, Format};
 pub use lens::Lens;
 pub use measure::{image_to_depth, image_to_labels, image_to_vectors};
 pub use rectify::Rectifier;
+pub use validity::{NothingLeft, Validity, sampled_mask};
 
 /// An 8-bit RGB picture, rows from the top.
 #[derive(Debug, Clone, PartialEq, Eq)]

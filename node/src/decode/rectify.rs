@@ -130,6 +130,33 @@ impl Rectifier {
         self.rectified_from_camera
     }
 
+    /// Per output pixel, row by row: whether the source image holds what it shows, by the middle of its footprint.
+    pub fn inside(&self) -> Vec<bool> {
+        match &self.path {
+            Path::Separable { cols, rows } => {
+                rows.inside().iter().flat_map(|&row| cols.inside().iter().map(move |&col| row && col)).collect()
+            }
+            Path::Warp(warp) => warp.inside(),
+        }
+    }
+
+    /// Per output pixel, row by row: whether `valid`, one flag per pixel of the source image, holds for all of the source pixels
+    /// that it is mixed of (up to one part in fifty); a mask of another size than [`Self::source_size`] holds everywhere.
+    pub fn carry(&self, valid: &[bool]) -> Vec<bool> {
+        /// Of 255: a mixture darkened by less cannot be told from rounding.
+        const WHOLE: u8 = 250;
+        let (width, height) = self.source;
+        let data = valid.iter().flat_map(|&v| [if v { u8::MAX } else { 0 }; 3]).collect();
+        let mixed = self.apply(&RgbPicture { width, height, data });
+        match mixed {
+            // What lies outside of the source is not this mask's to say.
+            Ok(out) => {
+                out.data.chunks_exact(3).zip(self.inside()).map(|(x, inside)| !inside || x[0] >= WHOLE).collect()
+            }
+            Err(_) => vec![true; self.intrinsics.width * self.intrinsics.height],
+        }
+    }
+
     /// The output picture.
     ///
     /// # Errors

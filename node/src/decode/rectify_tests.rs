@@ -1,5 +1,7 @@
 //! Rectification against pictures whose every ray is known.
 
+use proptest::prelude::*;
+
 use super::*;
 use crate::msg::Header;
 
@@ -239,6 +241,73 @@ fn beyond_the_fold_and_outside_is_black() {
             assert_eq!(p, [0; 3], "{tan}");
         } else if tan < 0.5 {
             assert_eq!(p, [255; 3], "{tan}");
+        }
+    }
+}
+
+/// Where a point of the output (pixel edges at integers) lies in the source picture; none where the lens does not see it.
+fn source_point(
+    info: &CameraInfo,
+    lens: &Lens,
+    (u, v): (f64, f64),
+    (width, height): (usize, usize),
+) -> Option<(f64, f64)> {
+    let (u, v) = (u * WIDTH as f64 / width as f64, v * HEIGHT as f64 / height as f64);
+    let x = (u - info.p[2] - HALF_PIXEL) / info.p[0];
+    let y = (v - info.p[6] - HALF_PIXEL) / info.p[5];
+    let r = DMat3::from_cols_array(&info.r).transpose();
+    let ray = r.transpose() * DVec3::new(x, y, 1.0);
+    let (x, y) = lens.project(ray).filter(|_| lens.off_axis(ray) <= lens.limit())?;
+    Some((info.k[0] * x + info.k[2] + HALF_PIXEL, info.k[4] * y + info.k[5] + HALF_PIXEL))
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// A pixel is valid exactly when its source lies within the source picture; pixels that straddle its edge may be either.
+    #[test]
+    fn valid_pixels_are_those_whose_source_is_in_the_picture(
+        model in 0usize..3, bend in -0.3f64..0.3, zoom in 0.5f64..1.3, turn in -0.1f64..0.1,
+        shift in -60.0f64..60.0, (width, height) in (8usize..70, 8usize..50),
+    ) {
+        let mut info = match model {
+            0 => camera("plumb_bob", &[bend, 0.0, 0.001, -0.001, 0.0]),
+            1 => camera("equidistant", &[0.1 * bend, 0.0, 0.0, 0.0]),
+            _ => camera("", &[]),
+        };
+        info.p = [420.0 * zoom, 0.0, 320.0 + shift, 0.0, 0.0, 410.0 * zoom, 200.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+        let turn = if model == 2 { DQuat::IDENTITY } else { DQuat::from_rotation_y(turn) };
+        info.r = DMat3::from_quat(turn).transpose().to_cols_array();
+        let lens = Lens::from_info(&info).unwrap();
+        let rectifier = Rectifier::new(&info, false, width, height).unwrap();
+        let inside = rectifier.inside();
+        prop_assert_eq!(inside.len(), width * height);
+        let within = |p: Option<(f64, f64)>| {
+            p.is_some_and(|(x, y)| (0.0..=WIDTH as f64).contains(&x) && (0.0..=HEIGHT as f64).contains(&y))
+        };
+        // Rectifying white shows what rectifying looked at.
+        let white = RgbPicture { width: WIDTH, height: HEIGHT, data: vec![255; WIDTH * HEIGHT * 3] };
+        let out = rectifier.apply(&white).unwrap();
+        for (i, &valid) in inside.iter().enumerate() {
+            let (col, row) = ((i % width) as f64, (i / width) as f64);
+            let looks = |step: f64| (0..9).map(move |k| (col + 0.5 + step * f64::from(k % 3 - 1), row + 0.5 + step * f64::from(k / 3 - 1)));
+            let seen = |p: (f64, f64)| within(source_point(&info, &lens, p, (width, height)));
+            if looks(0.5).all(seen) {
+                prop_assert!(valid, "pixel {} of {}x{}", i, width, height);
+            } else if !looks(0.5).any(seen) {
+                prop_assert!(!valid, "pixel {} of {}x{}", i, width, height);
+            }
+            prop_assert!(!valid || out.data[3 * i] == 255, "a valid pixel is seen");
+        }
+        // A mask over the source's left half hides what comes from there and nothing else.
+        let right: Vec<bool> = (0..WIDTH * HEIGHT).map(|i| i % WIDTH >= WIDTH / 2).collect();
+        for (i, shown) in rectifier.carry(&right).into_iter().enumerate() {
+            let at = source_point(&info, &lens, ((i % width) as f64 + 0.5, (i / width) as f64 + 0.5), (width, height));
+            // A footprint's width away from the edge of the mask.
+            let (Some((x, _)), reach) = (at, 2.0 * WIDTH as f64 / width as f64 / zoom.min(1.0)) else { continue };
+            if inside[i] && (x - WIDTH as f64 / 2.0).abs() > reach {
+                prop_assert_eq!(shown, x > WIDTH as f64 / 2.0, "pixel {}", i);
+            }
         }
     }
 }

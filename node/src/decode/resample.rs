@@ -4,9 +4,14 @@ use rayon::prelude::*;
 
 use super::RgbPicture;
 
-/// For every output index, the first source index and the weights from there on (empty: it sees nothing).
+/// How an output axis is made of a source axis.
 #[derive(Debug, Clone, PartialEq)]
-pub struct AxisWeights(Vec<(usize, Vec<f32>)>);
+pub struct AxisWeights {
+    /// For every output index, the first source index and the weights from there on (empty: it sees nothing).
+    weights: Vec<(usize, Vec<f32>)>,
+    /// Whether the middle of the output index lies within the source.
+    inside: Vec<bool>,
+}
 
 impl AxisWeights {
     /// Output coordinate `x` (pixel edges at integers) lies at `scale * x + shift` of a source with `source` pixels;
@@ -18,7 +23,13 @@ impl AxisWeights {
             let (from, to) = (scale * i as f64 + shift, scale * (i + 1) as f64 + shift);
             if scale >= 1.0 { area(from, to, end) } else { bilinear(0.5 * (from + to), end) }
         };
-        Self((0..output).map(one).collect())
+        let inside = |i: usize| (0.0..=end).contains(&(scale * (i as f64 + 0.5) + shift));
+        Self { weights: (0..output).map(one).collect(), inside: (0..output).map(inside).collect() }
+    }
+
+    /// For every output index whether its middle lies within the source.
+    pub fn inside(&self) -> &[bool] {
+        &self.inside
     }
 }
 
@@ -52,17 +63,17 @@ const PARALLEL_FROM_BYTES: usize = 8 << 20;
 
 /// Resamples along both axes. `rows` and `cols` must have been made for the picture's size.
 pub fn resample(picture: &RgbPicture, cols: &AxisWeights, rows: &AxisWeights) -> RgbPicture {
-    let (width, height) = (cols.0.len(), rows.0.len());
+    let (width, height) = (cols.weights.len(), rows.weights.len());
     let stride = picture.width * 3;
     let mut data = vec![0u8; width * height * 3];
     let sums = || vec![0.0f32; stride];
     if picture.data.len() >= PARALLEL_FROM_BYTES {
         data.par_chunks_mut(width * 3)
-            .zip(&rows.0)
+            .zip(&rows.weights)
             .for_each_init(sums, |sums, (out, row)| resample_row(picture, cols, row, sums, out));
     } else {
         let mut sums = sums();
-        for (out, row) in data.chunks_mut(width * 3).zip(&rows.0) {
+        for (out, row) in data.chunks_mut(width * 3).zip(&rows.weights) {
             resample_row(picture, cols, row, &mut sums, out);
         }
     }
@@ -85,7 +96,7 @@ fn resample_row(
     }
     let (sums, _) = sums.as_chunks::<3>();
     let (pixels, _) = out.as_chunks_mut::<3>();
-    for (pixel, (first, weights)) in pixels.iter_mut().zip(&cols.0) {
+    for (pixel, (first, weights)) in pixels.iter_mut().zip(&cols.weights) {
         let mut rgb = [0.5f32; 3];
         for (sum, weight) in sums.iter().skip(*first).zip(weights) {
             for (a, s) in rgb.iter_mut().zip(sum) {
@@ -153,7 +164,7 @@ mod tests {
         let (cols, rows) = (AxisWeights::new(50, w, 47.9, 1.3), AxisWeights::new(40, h, 29.7, -3.0));
         let many = resample(&p, &cols, &rows);
         let mut sums = vec![0.0; w * 3];
-        for (out, row) in many.data.chunks(150).zip(&rows.0) {
+        for (out, row) in many.data.chunks(150).zip(&rows.weights) {
             let mut alone = vec![0; 150];
             resample_row(&p, &cols, row, &mut sums, &mut alone);
             assert_eq!(out, alone);

@@ -78,6 +78,12 @@ impl Warp {
         RgbPicture { width, height, data }
     }
 
+    /// Whether at least half of an output pixel's samples lie within the source, row by row.
+    pub fn inside(&self) -> Vec<bool> {
+        let seen = |samples: &[Sample]| samples.iter().filter(|s| s.index != NOWHERE).count();
+        self.samples.chunks(self.per_pixel.max(1)).map(|samples| 2 * seen(samples) >= samples.len()).collect()
+    }
+
     /// Mean of the samples that see something; black when none does.
     fn mean(&self, pixels: &[u64], samples: &[Sample]) -> [u8; 3] {
         let (mut sum, mut seen) = ([0u32; 3], 0u32);

@@ -318,6 +318,7 @@ impl Engine {
                     time_sec: (window.time_sec[t][c]
                         + seconds_between(window.steps[t].frames[c].stamp_ns, sets[t].frames[c].stamp_ns))
                         as f32,
+                    valid: sets[t].frames[c].item.valid.as_deref(),
                 };
                 (0..cameras.len().min(pictures[t].len())).map(view).collect()
             })

@@ -17,7 +17,7 @@ use crate::pipeline::front::TruthImage;
 use crate::pipeline::step::Step;
 use crate::source::Frame;
 use crate::source::topics::TruthKind;
-use crate::window::PosedSet;
+use crate::window::{PosedFrame, PosedSet};
 
 use super::figures::Figures;
 use super::truth::{TruthAt, unit};
@@ -164,7 +164,7 @@ impl Scorer {
             let Some(view) = views.first() else { continue };
             let size = (view.width, view.height);
             let true01 = unit(&set.frames[camera].item.rgb.data);
-            let truth = self.truth_at(camera, stamp_ns, size);
+            let truth = self.truth_at(camera, &set.frames[camera], size);
             self.ours.push(truth.compare(&unit(&view.rgb8()), &true01, Some(&view.depth))?);
             if let Some(nearest) = nearest_context(step, camera, stamp_ns) {
                 self.nearest.push(truth.compare(&unit(nearest), &true01, None)?);
@@ -179,7 +179,7 @@ impl Scorer {
         let map_from_anchor = step.window.map_from_anchor.rotation.as_quat();
         let (mut pred, mut truth, mut depth) = (Vec::new(), Vec::new(), Vec::new());
         for (camera, view) in step.views.iter().enumerate() {
-            let at = self.truth_at(camera, newest.frames[camera].stamp_ns, (view.width, view.height));
+            let at = self.truth_at(camera, &newest.frames[camera], (view.width, view.height));
             let (Some(flow), Some(true_flow), Some(true_depth)) = (&view.flow, at.flow, at.depth) else { continue };
             pred.extend(flow.iter().map(|&f| (map_from_anchor * glam::Vec3::from(f)).to_array()));
             truth.extend(true_flow);
@@ -191,15 +191,15 @@ impl Scorer {
         Ok(())
     }
 
-    /// Ground truth at `size`, sampled at pixel centres.
-    fn truth_at(&self, camera: usize, stamp_ns: i64, size: (usize, usize)) -> TruthAt {
+    /// Ground truth of what a frame shows at `size`, sampled at pixel centres.
+    fn truth_at(&self, camera: usize, frame: &PosedFrame<Frame>, size: (usize, usize)) -> TruthAt {
         let mut at = TruthAt::none(size);
         for kind in TruthKind::ALL {
-            if let Some(image) = self.truth.get(&(stamp_ns, camera, kind)) {
+            if let Some(image) = self.truth.get(&(frame.stamp_ns, camera, kind)) {
                 at.set(kind, image);
             }
         }
-        at
+        at.seen(frame.item.valid.as_ref())
     }
 }
 

@@ -207,7 +207,7 @@ mod tests {
         let data = (0..WIDTH * HEIGHT * 3).map(|i| paint(i / 3)).collect();
         let rgb = RgbPicture { width: WIDTH, height: HEIGHT, data };
         let map_from_camera = Rigid::new(glam::DQuat::IDENTITY, glam::DVec3::ZERO);
-        let frame = PosedFrame { stamp_ns, map_from_camera, item: Frame { rgb: Arc::new(rgb) } };
+        let frame = PosedFrame { stamp_ns, map_from_camera, item: Frame::whole(rgb) };
         Arc::new(PosedSet { stamp_ns, epoch: 0, frames: vec![frame] })
     }
 
@@ -236,6 +236,7 @@ mod tests {
             intrinsics: cameras()[0],
             world_from_camera: glam::Affine3A::IDENTITY,
             time_sec: 0.0,
+            valid: None,
         };
         let clip = storm_model::ClipBatch::from_views(
             &[vec![view]],

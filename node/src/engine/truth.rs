@@ -1,5 +1,7 @@
 //! What is true of one picture, at the picture's size.
 
+use std::sync::Arc;
+
 use anyhow::Result;
 use storm_model::metrics::image::{Held, Image, ImageScores};
 use storm_render::world::WorldFrame;
@@ -23,12 +25,14 @@ pub struct TruthAt {
     pub sky: Option<Vec<u16>>,
     /// Object number, 0 for the static scene.
     pub instance: Option<Vec<u16>>,
+    /// Pixels the camera saw: no other is compared. `None`: it saw all.
+    pub valid: Option<Arc<[bool]>>,
 }
 
 impl TruthAt {
     /// Nothing known.
     pub fn none(size: (usize, usize)) -> Self {
-        Self { size, depth: None, flow: None, moving: None, sky: None, instance: None }
+        Self { size, depth: None, flow: None, moving: None, sky: None, instance: None, valid: None }
     }
 
     /// Of a drawn frame, at its own size.
@@ -41,7 +45,26 @@ impl TruthAt {
             moving: mask(frame.moving),
             sky: mask(frame.sky),
             instance: Some(frame.instance),
+            valid: None,
         }
+    }
+
+    /// The same of the pixels alone that a camera saw: elsewhere no depth is known, and nothing moves.
+    #[must_use]
+    pub fn seen(mut self, valid: Option<&Arc<[bool]>>) -> Self {
+        if let Some(valid) = valid {
+            let depths = self.depth.iter_mut().flatten().zip(valid.iter());
+            depths.filter(|(_, valid)| !**valid).for_each(|(depth, _)| *depth = 0.0);
+            for labels in [&mut self.moving, &mut self.instance].into_iter().flatten() {
+                labels.iter_mut().zip(valid.iter()).filter(|(_, valid)| !**valid).for_each(|(x, _)| *x = 0);
+            }
+        }
+        Self { valid: valid.cloned(), ..self }
+    }
+
+    /// Whether the camera saw pixel `i`.
+    pub fn is_valid(&self, i: usize) -> bool {
+        self.valid.as_ref().is_none_or(|valid| valid.get(i).copied().unwrap_or(true))
     }
 
     /// Takes one kind from a recorded image, sampled at pixel centres; an image whose length does not fit its size is none.
@@ -67,6 +90,7 @@ impl TruthAt {
             depth: depth.zip(self.depth.as_deref()),
             sky: sky.as_deref(),
             dynamic: dynamic.as_deref(),
+            valid: self.valid.as_deref(),
         };
         Ok(held.scores()?)
     }

@@ -39,8 +39,13 @@ pub struct Change {
 }
 
 /// The first place where `b` differs from `a` by more than noise; none where they show the same. Pictures of different sizes
-/// differ everywhere.
-pub fn first_change(a: &RgbPicture, b: &RgbPicture, sensitivity: Sensitivity) -> Option<Change> {
+/// differ everywhere. `valid`: the pixels that show something; others, and how many there are, change nothing. None: all do.
+pub fn first_change(
+    a: &RgbPicture,
+    b: &RgbPicture,
+    valid: Option<&[bool]>,
+    sensitivity: Sensitivity,
+) -> Option<Change> {
     let (w, h) = (a.width, a.height);
     let whole = |p: &RgbPicture| p.width == w && p.height == h && p.data.len() == 3 * w * h;
     if !whole(a) || !whole(b) {
@@ -50,24 +55,26 @@ pub fn first_change(a: &RgbPicture, b: &RgbPicture, sensitivity: Sensitivity) ->
         return None;
     }
     // Sum over the channels: what moves mostly changes all three alike, and noise grows more slowly than that.
-    let d: Vec<i16> = a
+    let mut d: Vec<i16> = a
         .data
         .chunks_exact(3)
         .zip(b.data.chunks_exact(3))
         .map(|(a, b)| (0..3).map(|c| i16::from(b[c]) - i16::from(a[c])).sum())
         .collect();
-    first_beyond(&d, None, (w, h), sensitivity)
+    leave_out(&mut d, valid);
+    first_beyond(&d, None, valid, (w, h), sensitivity)
 }
 
 /// The first place where `d`, differences summed over the three channels of a picture of this width and height, is beyond noise;
-/// `slack`, per pixel and summed likewise, is allowed on top.
+/// `slack`, per pixel and summed likewise, is allowed on top. `valid` as in [`first_change`]; what is not has to be 0 in `d`.
 pub(super) fn first_beyond(
     d: &[i16],
     slack: Option<&[f32]>,
+    valid: Option<&[bool]>,
     (w, h): (usize, usize),
     sensitivity: Sensitivity,
 ) -> Option<Change> {
-    let sigma = noise(d, w).clamp(LEAST_SIGMA * 3f32.sqrt(), MOST_SIGMA * 3f32.sqrt());
+    let sigma = noise(d, w, valid).clamp(LEAST_SIGMA * 3f32.sqrt(), MOST_SIGMA * 3f32.sqrt());
     let pixel_limit =
         (PIXEL_SIGMAS_FACTOR * sensitivity.sigmas * sigma).max(PIXEL_LEVELS_FACTOR * 3.0 * sensitivity.levels);
     let limit = (sensitivity.sigmas * sigma / ((PATCH * PATCH) as f32).sqrt()).max(3.0 * sensitivity.levels);
@@ -75,6 +82,13 @@ pub(super) fn first_beyond(
         return if quiet(d, w, [pixel_limit, limit]) { None } else { place(d, None, (w, h), [pixel_limit, limit]) };
     }
     place(d, slack, (w, h), [pixel_limit, limit])
+}
+
+/// Puts 0 where nothing is shown.
+pub(super) fn leave_out(d: &mut [i16], valid: Option<&[bool]>) {
+    if let Some(valid) = valid {
+        d.iter_mut().zip(valid).filter(|(_, valid)| !**valid).for_each(|(d, _)| *d = 0);
+    }
 }
 
 /// Whether no pixel and no patch is beyond its limit: what [`place`] says of most pictures of a scene at rest; several times quicker.
@@ -129,16 +143,27 @@ fn place(d: &[i16], slack: Option<&[f32]>, (w, h): (usize, usize), [pixel_limit,
 }
 
 /// Standard deviation of the noise in a picture of differences. From neighbours' differences, so that a change of exposure,
-/// which is the same everywhere, is not taken for noise; from their median, so that a mover is not either.
-fn noise(d: &[i16], width: usize) -> f32 {
+/// which is the same everywhere, is not taken for noise; from their median, so that a mover is not either. `valid`: the pixels
+/// that count.
+fn noise(d: &[i16], width: usize, valid: Option<&[bool]>) -> f32 {
     // Differences of sums of three 8-bit differences fit; larger ones are beyond `MOST_SIGMA` in any case.
     let mut counts = [0u32; 2048];
     let mut all = 0;
-    for row in d.chunks_exact(width.max(1)) {
-        for (a, b) in row.iter().zip(&row[1..]) {
-            counts[usize::from(a.abs_diff(*b)).min(counts.len() - 1)] += 1;
+    for (r, row) in d.chunks_exact(width.max(1)).enumerate() {
+        match valid.and_then(|valid| valid.get(r * width..(r + 1) * width)) {
+            Some(valid) => {
+                for (pair, _) in row.windows(2).zip(valid.windows(2)).filter(|(_, valid)| valid[0] && valid[1]) {
+                    counts[usize::from(pair[0].abs_diff(pair[1])).min(counts.len() - 1)] += 1;
+                    all += 1;
+                }
+            }
+            None => {
+                for (a, b) in row.iter().zip(&row[1..]) {
+                    counts[usize::from(a.abs_diff(*b)).min(counts.len() - 1)] += 1;
+                }
+                all += row.len() as u32 - 1;
+            }
         }
-        all += row.len() as u32 - 1;
     }
     let mut below = 0;
     let median = counts.iter().position(|&n| {
@@ -187,7 +212,7 @@ mod tests {
         for (k, sigma) in [0.0, 0.5, 1.0, 2.0, 4.0].into_iter().enumerate() {
             for seed in 0..40 {
                 let (a, b) = (picture(1000 * k as u64 + seed, sigma), picture(1000 * k as u64 + seed + 500, sigma));
-                assert_eq!(first_change(&a, &b, NORMAL), None, "sigma {sigma}, seed {seed}");
+                assert_eq!(first_change(&a, &b, None, NORMAL), None, "sigma {sigma}, seed {seed}");
             }
         }
     }
@@ -198,7 +223,7 @@ mod tests {
             for (side, levels) in [(2, 40), (3, 25), (4, -15), (8, 8)] {
                 for seed in 0..10 {
                     let (a, b) = (picture(seed, sigma), changed(picture(seed + 500, sigma), side, levels));
-                    let change = first_change(&a, &b, NORMAL);
+                    let change = first_change(&a, &b, None, NORMAL);
                     let change = change.unwrap_or_else(|| panic!("{side} pixels by {levels} in noise {sigma}"));
                     assert!(change.at[0].abs_diff(50) <= 8 && change.at[1].abs_diff(30) <= 8, "{change:?}");
                 }
@@ -226,7 +251,29 @@ mod tests {
                 d.chunks_exact(w).flat_map(|row| row.windows(2).map(|p| p[0].abs_diff(p[1]).min(2047))).collect();
             steps.sort_unstable();
             let median = steps.get(steps.len() / 2).copied().unwrap_or(0);
-            prop_assert_eq!(noise(&d, w), SIGMA_OVER_MAD * f32::from(median) / std::f32::consts::SQRT_2);
+            prop_assert_eq!(noise(&d, w, None), SIGMA_OVER_MAD * f32::from(median) / std::f32::consts::SQRT_2);
+        }
+    }
+
+    #[test]
+    fn what_shows_nothing_is_no_change_and_hides_none() {
+        // The upper half shows nothing; whatever stands there changes from one to the other.
+        let valid: Vec<bool> = (0..96 * 64).map(|i| i / 96 >= 32).collect();
+        for seed in 0..20 {
+            let (a, mut b) = (picture(seed, 2.0), picture(seed + 500, 2.0));
+            b.data[..3 * 96 * 32].iter_mut().enumerate().for_each(|(i, x)| *x = (i * 13 % 256) as u8);
+            assert_eq!(first_change(&a, &b, Some(&valid), NORMAL), None, "seed {seed}");
+            assert!(first_change(&a, &b, None, NORMAL).is_some());
+            // A small mover in the lower half is seen all the same, and noise is that of the lower half.
+            let (side, levels) = (3, 25);
+            for y in 40..40 + side {
+                for x in 50..50 + side {
+                    (0..3).for_each(|c| {
+                        b.data[3 * (y * 96 + x) + c] = b.data[3 * (y * 96 + x) + c].saturating_add(levels)
+                    });
+                }
+            }
+            assert!(first_change(&a, &b, Some(&valid), NORMAL).is_some_and(|change| change.at[1] >= 32));
         }
     }
 
@@ -235,18 +282,18 @@ mod tests {
         let a = picture(1, 2.0);
         let mut b = picture(2, 2.0);
         b.data.iter_mut().for_each(|x| *x = x.saturating_add(4));
-        assert!(first_change(&a, &b, NORMAL).is_some());
+        assert!(first_change(&a, &b, None, NORMAL).is_some());
         let smaller = RgbPicture { width: 48, height: 64, data: vec![0; 48 * 64 * 3] };
-        assert!(first_change(&a, &smaller, NORMAL).is_some());
+        assert!(first_change(&a, &smaller, None, NORMAL).is_some());
         let broken = RgbPicture { width: 96, height: 64, data: vec![0; 7] };
-        assert!(first_change(&a, &broken, NORMAL).is_some());
-        assert_eq!(first_change(&broken, &broken, NORMAL).map(|c| c.at), Some([0, 0]));
+        assert!(first_change(&a, &broken, None, NORMAL).is_some());
+        assert_eq!(first_change(&broken, &broken, None, NORMAL).map(|c| c.at), Some([0, 0]));
     }
 
     #[test]
     fn pictures_smaller_than_a_patch_are_compared_too() {
         let one = |x| RgbPicture { width: 2, height: 1, data: vec![x; 6] };
-        assert_eq!(first_change(&one(10), &one(11), NORMAL), None);
-        assert!(first_change(&one(10), &one(40), NORMAL).is_some());
+        assert_eq!(first_change(&one(10), &one(11), None, NORMAL), None);
+        assert!(first_change(&one(10), &one(40), None, NORMAL).is_some());
     }
 }

@@ -6,14 +6,16 @@
 //! and by more than a texture that lies half a pixel off changes it, is something new: a mover whose speed is wrong, somebody who
 //! steps out, light that has changed, a place never seen. It is looked for in every patch, never in the mean.
 
+use std::sync::Arc;
+
 use glam::{Affine3A, Vec3};
 use rayon::prelude::*;
 use storm_model::scene::{RenderedView, Scene};
 use storm_render::{Intrinsics, View};
 
-use super::change::{Change, Sensitivity, first_beyond};
+use super::change::{Change, Sensitivity, first_beyond, leave_out};
 use super::skipper::Computed;
-use super::{Angle, pictures_mean};
+use super::{Angle, pictures_mean, shown};
 use crate::config::SkipConfig;
 use crate::engine::select::SURFACE_OPACITY;
 use crate::source::Frame;
@@ -105,13 +107,13 @@ pub fn pixel_flow(
 ) -> PixelFlow {
     let mut all = PixelFlow::default();
     let Some(newest) = new.steps.last() else { return all };
-    for ((view, pose), camera) in views.iter().zip(poses(computed, newest)).zip(cameras) {
+    for (((view, pose), camera), frame) in views.iter().zip(poses(computed, newest)).zip(cameras).zip(&newest.frames) {
         for i in 0..view.depth.len() {
             let ray = camera.ray((i % view.width) as f32 + 0.5, (i / view.width) as f32 + 0.5);
             let solid = view.alpha[i] >= SURFACE_OPACITY;
             all.positions.push(pose.transform_point3(ray * view.depth[i]).to_array());
             all.velocities.push(velocity(view, i).to_array());
-            all.valid.push(solid && view.depth[i] > 0.0);
+            all.valid.push(solid && view.depth[i] > 0.0 && frame.item.is_valid(i));
         }
     }
     all
@@ -150,6 +152,7 @@ fn steepness(frame: &Frame, (w, h): (usize, usize)) -> Vec<f32> {
 struct Known {
     view: View,
     residual: Vec<i16>,
+    valid: Option<Arc<[bool]>>,
     steepness: Vec<f32>,
     rms: f32,
 }
@@ -172,6 +175,9 @@ impl Known {
             (first + k.width, (1.0 - a) * b),
             (first + k.width + 1, a * b),
         ];
+        if self.valid.as_ref().is_some_and(|valid| four.iter().any(|&(i, _)| !valid[i])) {
+            return None;
+        }
         let residual = four.iter().map(|&(i, w)| w * f32::from(self.residual[i])).sum();
         let steepness = four.iter().map(|&(i, _)| self.steepness[i]).fold(0.0, f32::max);
         Some((residual, steepness))
@@ -202,9 +208,18 @@ pub fn explains(
         .map(|c| {
             let (frame, view) = (&then.frames[c].item, &computed.views[c]);
             let residual = residual(frame, view)?;
-            let power = residual.iter().map(|&r| f32::from(r).powi(2)).sum::<f32>() / residual.len().max(1) as f32;
+            let valid = frame.valid.clone();
+            let powers = residual.iter().enumerate().filter(|(i, _)| frame.is_valid(*i));
+            let power =
+                powers.map(|(_, &r)| f32::from(r).powi(2)).sum::<f32>() / shown(residual.len(), valid.as_deref());
             let steepness = steepness(frame, (view.width, view.height));
-            Some(Known { view: View::from_pose(then_poses[c], cameras[c]), residual, steepness, rms: power.sqrt() })
+            Some(Known {
+                view: View::from_pose(then_poses[c], cameras[c]),
+                residual,
+                valid,
+                steepness,
+                rms: power.sqrt(),
+            })
         })
         .collect::<Option<_>>()
         .ok_or(Unexplained::Shape)?;
@@ -214,7 +229,8 @@ pub fn explains(
     (0..count).into_par_iter().try_for_each(|camera| {
         let view = &views[camera];
         let (w, h) = (view.width, view.height);
-        let now = residual(&now.frames[camera].item, view).ok_or(Unexplained::Shape)?;
+        let frame = &now.frames[camera].item;
+        let now = residual(frame, view).ok_or(Unexplained::Shape)?;
         let own = cameras[camera];
         let mut slack = vec![0f32; w * h];
         let mut off = vec![0i16; w * h];
@@ -233,11 +249,13 @@ pub fn explains(
             off[i] = gap.round() as i16;
             slack[i] = allowed;
         }
-        let levels = pictures_mean(&off) / 3.0;
+        let valid = frame.valid.as_deref();
+        leave_out(&mut off, valid);
+        let levels = pictures_mean(&off, valid) / 3.0;
         if levels.abs() > config.still_levels as f32 {
             return Err(Unexplained::Exposure { camera, levels });
         }
-        match first_beyond(&off, Some(&slack), (w, h), sensitivity) {
+        match first_beyond(&off, Some(&slack), valid, (w, h), sensitivity) {
             Some(change) => Err(Unexplained::Picture { camera, change }),
             None => Ok(()),
         }

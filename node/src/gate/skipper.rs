@@ -269,14 +269,20 @@ pub fn difference(
         if let Some(frame) = pictures.frames.get(k) {
             let truth = &frame.item.rgb.data;
             let error = |view: &RenderedView| -> f64 {
-                view.rgb8().iter().zip(truth).map(|(&x, &y)| (f64::from(x) - f64::from(y)).powi(2)).sum()
+                let gaps = view.rgb8().into_iter().zip(truth).enumerate();
+                let seen = gaps.filter(|(i, _)| frame.item.is_valid(i / 3));
+                seen.map(|(_, (x, &y))| (f64::from(x) - f64::from(y)).powi(2)).sum()
             };
             full_error += error(a);
             skipped_error += error(b);
-            samples += truth.len();
+            samples += match &frame.item.valid {
+                Some(valid) => 3 * valid.iter().filter(|valid| **valid).count(),
+                None => truth.len(),
+            };
         }
-        let velocities = a.flow.iter().flatten().zip(b.flow.iter().flatten());
-        velocities.for_each(|(v, w)| flow.add(*v, (turn * Vec3::from(*w)).to_array()));
+        let shown = |i: usize| pictures.frames.get(k).is_none_or(|frame| frame.item.is_valid(i));
+        let velocities = a.flow.iter().flatten().zip(b.flow.iter().flatten()).enumerate();
+        velocities.filter(|(i, _)| shown(*i)).for_each(|(_, (v, w))| flow.add(*v, (turn * Vec3::from(*w)).to_array()));
     }
     // The loss of PSNR is the ratio of the squared errors; pictures that are exact cannot be told apart below a level.
     let floor = samples.max(1) as f64 / 12.0;
@@ -355,7 +361,7 @@ mod tests {
         let frame = PosedFrame {
             stamp_ns: 0,
             map_from_camera: Rigid::new(glam::DQuat::IDENTITY, glam::DVec3::ZERO),
-            item: Frame { rgb: Arc::new(rgb) },
+            item: Frame::whole(rgb),
         };
         PosedSet { stamp_ns: 0, epoch: 0, frames: vec![frame] }
     }

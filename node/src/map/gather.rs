@@ -154,7 +154,7 @@ fn depth_views(look: &SceneLook) -> Vec<DepthView> {
                 let opacity = scene.gaussians.opacities[i];
                 if opacity >= SURFACE_OPACITY {
                     camera_from_anchor.transform_point3(scene.gaussians.means[i].into()).z
-                } else if opacity <= SKY_OPACITY {
+                } else if opacity <= SKY_OPACITY && scene.is_valid(i) {
                     f32::INFINITY
                 } else {
                     0.0

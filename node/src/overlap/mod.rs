@@ -265,7 +265,10 @@ fn pictures_of(scene: &Scene, look: &OverlapLook) -> Vec<Picture> {
                     let z = camera_from_anchor.transform_point3(Vec3::from(g.means[i])).z;
                     // The sky is without end; what is neither sky nor surface says nothing.
                     let opacity = g.opacities[i];
-                    if opacity >= crate::engine::select::SURFACE_OPACITY && z > 0.0 {
+                    if !scene.is_valid(i) {
+                        // Nobody saw it: it is no sky.
+                        f32::NAN
+                    } else if opacity >= crate::engine::select::SURFACE_OPACITY && z > 0.0 {
                         z
                     } else if opacity <= SKY_OPACITY {
                         f32::INFINITY

@@ -80,7 +80,8 @@ impl Street {
         let config = Arc::new(ModelConfig::preset("tiny").unwrap());
         let none = (Vec::new(), Vec::new());
         let (affine, motion_bases) = none;
-        let scene = Scene { gaussians: g, shape: SHAPE, depths, sky: None, affine, motion_bases, config };
+        let scene =
+            Scene { gaussians: g, shape: SHAPE, depths, valid: Vec::new(), sky: None, affine, motion_bases, config };
         (scene, on_box, map_from_anchor)
     }
 

@@ -335,7 +335,7 @@ mod tests {
         let mut front = Front::new(&config, &rig, PoseStore::nothing(&config.sync));
         let (set, _) = posed_set(&Drive::new(&options).unwrap(), 0);
         let map_from_base = set.frames[0].map_from_camera;
-        let frame = Frame { rgb: Arc::new(RgbPicture { width: 1, height: 1, data: vec![0; 3] }) };
+        let frame = Frame::whole(RgbPicture { width: 1, height: 1, data: vec![0; 3] });
         let mut out = VecDeque::new();
         let mut feed = |front: &mut Front, range: std::ops::Range<i64>, cameras: &[usize]| {
             for i in range {

@@ -99,7 +99,8 @@ pub fn flow(step: &Step, counts: &mut Published) -> Result<PointCloud2, OutputEr
     }
     let range = select::from_step(&step.scene, shape.timesteps - 1);
     // A pixel that its own Gaussian hardly covers shows the sky.
-    let valid: Vec<bool> = g.opacities[range.clone()].iter().map(|&o| o >= select::SURFACE_OPACITY).collect();
+    let shows = |i: usize| g.opacities[i] >= select::SURFACE_OPACITY && step.scene.is_valid(i);
+    let valid: Vec<bool> = range.clone().map(shows).collect();
     let cloud = FlowCloud {
         width,
         height,

@@ -71,6 +71,8 @@ pub struct Metrics {
     pub skips: SkipCounts,
     /// Images dropped, by reason; every reason is listed.
     pub dropped: BTreeMap<String, u64>,
+    /// Share of each camera's pixels that show nothing and take no part, 0 to 1, in the cameras' order.
+    pub masked_share: Vec<f64>,
     /// Poses, transforms and ground truth that could not be read.
     pub messages_lost: u64,
     /// Poses refused (not finite, not a rotation).

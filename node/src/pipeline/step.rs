@@ -319,6 +319,8 @@ pub fn newest_time_sec(window: &Window<Frame>) -> f32 {
 }
 
 #[cfg(test)]
+mod masked_tests;
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::engine::ModelSource;

@@ -28,7 +28,7 @@ pub struct Shot {
     pub view: View,
     /// `height * width * 3` colours of 0-1.
     pub rgb01: Vec<f32>,
-    /// Pixels that may show something that moves.
+    /// Pixels that may show something that moves, or show nothing.
     pub moves: Vec<bool>,
     /// Never fitted to.
     pub held_out: bool,
@@ -130,7 +130,8 @@ pub fn shots(
             for (frame, k) in set.frames.iter().zip(&cameras) {
                 let local_from_camera = crate::window::relative(map_from_local, &frame.map_from_camera);
                 let view = View::from_pose(local_from_camera.to_f32(), *k);
-                let moves = covered(&view, &local_from_map, boxes.at(set.stamp_ns).copied());
+                let mut moves = covered(&view, &local_from_map, boxes.at(set.stamp_ns).copied());
+                moves.iter_mut().enumerate().for_each(|(i, moves)| *moves |= !frame.item.is_valid(i));
                 let held_out = hold_out > 0 && moment % hold_out == hold_out - 1;
                 out.push(Shot { view, rgb01: unit(&frame.item.rgb.data), moves, held_out });
             }

@@ -122,7 +122,7 @@ pub fn refine(
                 wanted[3 * i..3 * i + 3].copy_from_slice(&drawn[3 * i..3 * i + 3]);
             }
             let picture = Reference::new(&wanted, k.width, k.height);
-            targets.push(Target { view: shot.view, picture, sky: Vec::new(), exposure: Affine::IDENTITY });
+            targets.push(Target { view: shot.view, picture, sky: Vec::new(), exposure: Affine::IDENTITY, valid: None });
         }
         let judged = Judged { view: shot.view, rgb01: shot.rgb01.clone(), counts };
         if shot.held_out { &mut held_out } else { &mut fitted }.push(judged);

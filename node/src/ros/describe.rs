@@ -7,11 +7,13 @@ use tracing::warn;
 use super::topics::{LivePlan, LivePose};
 use crate::cdr::decode as cdr;
 use crate::config::Config;
+use crate::decode::FrameFinder;
 use crate::msg::{CameraInfo, TransformStamped};
 use crate::pipeline::posed::PoseStore;
 use crate::poses::PoseBuffer;
 use crate::source::Rig;
 use crate::source::bag::static_tree;
+use crate::source::look_at;
 use crate::source::rig::CameraDescription;
 
 /// Static transforms kept; they are sent once each.
@@ -22,6 +24,7 @@ pub struct Describer {
     plan: LivePlan,
     infos: Vec<Option<CameraInfo>>,
     frames: Vec<Option<String>>,
+    finders: Vec<FrameFinder>,
     statics: Vec<TransformStamped>,
     pose_child: Option<String>,
     changed: bool,
@@ -33,7 +36,8 @@ impl Describer {
     pub fn new(plan: LivePlan) -> Self {
         let n = plan.cameras.len();
         let (infos, frames, statics) = (vec![None; n], vec![None; n], Vec::new());
-        Self { plan, infos, frames, statics, pose_child: None, changed: true, missing: String::new() }
+        let finders = vec![FrameFinder::default(); n];
+        Self { plan, infos, frames, finders, statics, pose_child: None, changed: true, missing: String::new() }
     }
 
     /// A CameraInfo; true when it says something else than the one before.
@@ -58,8 +62,14 @@ impl Describer {
         }
     }
 
-    /// A picture: its frame is what matters here.
+    /// A picture: its frame is what matters here, and the black around the first ones.
     pub fn picture(&mut self, camera: usize, data: &[u8]) {
+        if let (Some(finder), Some(topics)) = (self.finders.get_mut(camera), self.plan.cameras.get(camera))
+            && !finder.settled()
+        {
+            look_at(finder, topics.compressed, data);
+            self.changed |= finder.settled();
+        }
         if let Some(place @ None) = self.frames.get_mut(camera)
             && let Ok(header) = cdr::header(data)
         {
@@ -108,6 +118,8 @@ impl Describer {
             }
             if self.frames[i].is_none() {
                 missing.push(format!("no picture on {}", camera.image));
+            } else if config.input.find_black_frame && !self.finders[i].settled() {
+                missing.push(format!("more pictures on {} to see whether their black border stays", camera.image));
             }
         }
         if let (LivePose::Message { topic, .. }, None) = (&self.plan.pose, &self.pose_child) {
@@ -117,13 +129,14 @@ impl Describer {
             self.missing = missing.join(", ");
             return None;
         }
-        let cameras = self.plan.cameras.iter().zip(&self.infos).zip(&self.frames);
+        let cameras = self.plan.cameras.iter().zip(&self.infos).zip(&self.frames).zip(&self.finders);
         let described = cameras
-            .map(|((camera, info), frame_id)| CameraDescription {
+            .map(|(((camera, info), frame_id), finder)| CameraDescription {
                 topic: camera.image.clone(),
                 info_topic: camera.info.clone(),
                 frame_id: frame_id.clone(),
                 info: info.clone(),
+                black_frame: finder.found(),
             })
             .collect();
         let tree = static_tree(&config.sync, &self.statics);

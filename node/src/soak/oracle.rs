@@ -295,6 +295,7 @@ impl OracleWindow {
             gaussians: g,
             shape,
             depths,
+            valid: Vec::new(),
             sky: None,
             affine: Vec::new(),
             motion_bases: Vec::new(),

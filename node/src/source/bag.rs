@@ -15,6 +15,7 @@ use crate::tf::TfTree;
 
 use super::event::Event;
 use super::first::FirstPictures;
+use super::first_images::black_frames;
 use super::rig::{CameraDescription, Rig};
 use super::topics::{COMPRESSED, PoseTopic, TopicError, TopicPlan};
 use super::translate::{Role, translate};
@@ -44,8 +45,12 @@ impl BagSource {
         for left_out in &plan.left_out {
             info!("no camera: {left_out}");
         }
-        let (described, pose_child, static_transforms) =
+        let (mut described, pose_child, static_transforms) =
             describe(&bag, &plan).with_context(|| format!("bag {}", path.display()))?;
+        if config.input.find_black_frame {
+            let frames = black_frames(&bag, &plan).with_context(|| format!("bag {}", path.display()))?;
+            described.iter_mut().zip(frames).for_each(|(camera, frame)| camera.black_frame = frame);
+        }
         let rig = Rig::build(
             described,
             &static_tree(&config.sync, &static_transforms),
@@ -223,6 +228,7 @@ fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, Stri
             info_topic: bag.topics()[c.info].name.clone(),
             frame_id,
             info,
+            black_frame: None,
         })
         .collect();
     Ok((described, pose_child.unwrap_or_default(), statics))

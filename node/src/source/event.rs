@@ -12,8 +12,22 @@ use super::topics::TruthKind;
 /// One camera's picture at the network's size, rectified.
 #[derive(Debug, Clone)]
 pub struct Frame {
-    /// The picture.
+    /// The picture; pixels that show nothing have their neighbours' colours.
     pub rgb: Arc<RgbPicture>,
+    /// Per pixel, row by row: whether it shows something. None: all do.
+    pub valid: Option<Arc<[bool]>>,
+}
+
+impl Frame {
+    /// A picture whose pixels all show something.
+    pub fn whole(rgb: RgbPicture) -> Self {
+        Self { rgb: Arc::new(rgb), valid: None }
+    }
+
+    /// Whether pixel `i` shows something.
+    pub fn is_valid(&self, i: usize) -> bool {
+        self.valid.as_ref().is_none_or(|valid| valid.get(i).copied().unwrap_or(true))
+    }
 }
 
 /// One ground-truth image, at the recording's own size.

@@ -5,11 +5,14 @@ pub mod bag;
 pub mod cameras;
 pub mod event;
 mod first;
+mod first_images;
+pub mod masks;
 pub mod rig;
 pub mod topics;
 pub mod translate;
 pub mod world;
 
 pub use event::{Event, Frame, Truth};
+pub use first_images::look_at;
 pub use rig::{Rig, RigError};
 pub use topics::{TopicError, TopicPlan};

@@ -2,13 +2,16 @@
 
 use storm_render::Intrinsics;
 use thiserror::Error;
+use tracing::info;
 
 use crate::config::InputConfig;
-use crate::decode::{DecodeError, Rectifier};
+use crate::decode::{BlackFrame, DecodeError, Rectifier, Validity};
 use crate::extrinsics;
 use crate::msg;
 use crate::rigid::Rigid;
 use crate::tf::{TfLookup, TfTree};
+
+use super::masks::{MaskError, Masks};
 
 /// Vehicle frame assumed when neither the configuration nor the pose message names one (REP 105).
 pub const DEFAULT_BASE_FRAME: &str = "base_link";
@@ -60,6 +63,9 @@ pub enum RigError {
         /// What the tree said.
         detail: String,
     },
+    /// A mask of `input.masks` cannot be used.
+    #[error(transparent)]
+    Mask(#[from] MaskError),
     /// The configuration has more or fewer mountings than there are cameras.
     #[error("{key} has {given} entries for {cameras} cameras")]
     Count {
@@ -84,6 +90,17 @@ pub struct RigCamera {
     pub rectifier: Rectifier,
     /// Intrinsics of the network's picture.
     pub intrinsics: Intrinsics,
+    /// Pixels of the network's picture that show something; none: all do.
+    pub validity: Option<Validity>,
+    /// The black frame of its images, for people; empty: there is none.
+    pub black_frame: String,
+}
+
+impl RigCamera {
+    /// Share of the network's picture that shows nothing, 0 to 1.
+    pub fn masked_share(&self) -> f64 {
+        self.validity.as_ref().map_or(0.0, Validity::masked_share)
+    }
 }
 
 /// What is known about a camera before its mounting is looked up.
@@ -96,6 +113,8 @@ pub struct CameraDescription {
     pub frame_id: Option<String>,
     /// Its CameraInfo; `None` when there was none.
     pub info: Option<msg::CameraInfo>,
+    /// The black frame of its first images, where there is one.
+    pub black_frame: Option<BlackFrame>,
 }
 
 /// All cameras, in the network's order.
@@ -138,9 +157,11 @@ impl Rig {
             .unwrap_or(DEFAULT_BASE_FRAME)
             .trim_start_matches('/')
             .to_string();
+        let topics: Vec<&str> = described.iter().map(|d| d.topic.as_str()).collect();
+        let masks = Masks::read(&config.masks, &topics)?;
         let mut cameras = Vec::with_capacity(n);
         for (camera, d) in described.into_iter().enumerate() {
-            let CameraDescription { topic, info_topic, frame_id, info } = d;
+            let CameraDescription { topic, info_topic, frame_id, info, black_frame } = d;
             let Some(info) = info else { return Err(RigError::NoInfo { camera, topic, info_topic }) };
             let Some(frame_id) = frame_id else { return Err(RigError::NoImage { camera, topic }) };
             let rectified = is_rectified(&topic, &config.rectified);
@@ -164,12 +185,31 @@ impl Rig {
                 None => mount,
             };
             let intrinsics = rectifier.intrinsics();
-            cameras.push(RigCamera { topic, frame_id, base_from_camera, rectifier, intrinsics });
+            let black_frame = black_frame.filter(|_| config.find_black_frame);
+            let validity = masks.validity(camera, &topic, &rectifier, black_frame.as_ref())?;
+            let black_frame = black_frame.map_or_else(String::new, |frame| frame.describe());
+            cameras.push(RigCamera { topic, frame_id, base_from_camera, rectifier, intrinsics, validity, black_frame });
         }
         let mounts: Vec<Rigid> = cameras.iter().map(|c| c.base_from_camera).collect();
         let configured = usize::try_from(config.reference_camera).ok().filter(|&i| i < n);
         let reference = configured.or_else(|| extrinsics::reference_camera(&mounts)).unwrap_or(0);
-        Ok(Self { cameras, reference, base_frame })
+        let rig = Self { cameras, reference, base_frame };
+        rig.say_masked();
+        Ok(rig)
+    }
+
+    /// Says which pixels are left out.
+    fn say_masked(&self) {
+        for (i, camera) in self.cameras.iter().enumerate().filter(|(_, c)| c.validity.is_some()) {
+            if !camera.black_frame.is_empty() {
+                info!(
+                    "camera {i} ({}): {} are black in every image and are left out",
+                    camera.topic, camera.black_frame
+                );
+            }
+            let percent = 100.0 * camera.masked_share();
+            info!("camera {i} ({}): {percent:.1} % of the pixels show nothing and take no part", camera.topic);
+        }
     }
 }
 

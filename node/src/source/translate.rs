@@ -5,12 +5,12 @@ use std::sync::Arc;
 use anyhow::Result;
 
 use crate::cdr::decode as cdr;
-use crate::decode::{self, RgbPicture};
+use crate::decode;
 use crate::pipeline::guard::caught;
 use crate::sync::DropReason;
 
 use super::event::{Event, Frame, Truth};
-use super::rig::Rig;
+use super::rig::{Rig, RigCamera};
 use super::topics::TruthKind;
 
 /// What a topic's messages are turned into.
@@ -62,8 +62,8 @@ pub fn translate(rig: &Rig, role: &Role, topic: &str, data: &[u8], logged_ns: i6
 fn events(rig: &Rig, role: &Role, data: &[u8]) -> Result<Vec<Event>> {
     Ok(match role {
         Role::Image { camera, compressed } => {
-            let (stamp_ns, rgb) = picture(rig, *camera, *compressed, data)?;
-            vec![Event::Image { camera: *camera, stamp_ns, frame: Frame { rgb: Arc::new(rgb) } }]
+            let (stamp_ns, frame) = picture(rig, *camera, *compressed, data)?;
+            vec![Event::Image { camera: *camera, stamp_ns, frame }]
         }
         Role::Pose { type_name } => {
             let p = cdr::pose(type_name, data)?;
@@ -79,8 +79,8 @@ fn events(rig: &Rig, role: &Role, data: &[u8]) -> Result<Vec<Event>> {
     })
 }
 
-fn picture(rig: &Rig, camera: usize, compressed: bool, data: &[u8]) -> Result<(i64, RgbPicture)> {
-    let rectifier = &rig.cameras[camera].rectifier;
+fn picture(rig: &Rig, camera: usize, compressed: bool, data: &[u8]) -> Result<(i64, Frame)> {
+    let RigCamera { rectifier, validity, .. } = &rig.cameras[camera];
     let (stamp_ns, full) = if compressed {
         let image = cdr::compressed_image(data)?;
         (image.header.stamp_ns, decode::compressed_of_size(&image, Some(rectifier.source_size()))?)
@@ -88,7 +88,11 @@ fn picture(rig: &Rig, camera: usize, compressed: bool, data: &[u8]) -> Result<(i
         let image = cdr::image(data)?;
         (image.header.stamp_ns, decode::image_to_rgb(&image)?)
     };
-    Ok((stamp_ns, rectifier.apply(&full)?))
+    let mut rgb = rectifier.apply(&full)?;
+    if let Some(validity) = validity {
+        validity.fill(&mut rgb);
+    }
+    Ok((stamp_ns, Frame { rgb: Arc::new(rgb), valid: validity.as_ref().map(|v| v.valid().clone()) }))
 }
 
 fn truth(camera: usize, kind: TruthKind, data: &[u8]) -> Result<Event> {

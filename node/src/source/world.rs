@@ -25,7 +25,7 @@ pub fn posed_set(drive: &Drive, frame: usize) -> (PosedSet<Frame>, Vec<WorldFram
         frames.push(PosedFrame {
             stamp_ns: (time_sec * 1e9).round() as i64,
             map_from_camera: Rigid::from(&(drive.map_from_base(time_sec) * c.base_from_camera)),
-            item: Frame { rgb: Arc::new(rgb) },
+            item: Frame::whole(rgb),
         });
         truth.push(picture);
     }

@@ -73,7 +73,13 @@ pub fn run(subject: &mut Subject, found: &mut dyn FnMut(Case)) -> Result<()> {
     for (name, value) in [("NaN", f32::NAN), ("infinity", f32::INFINITY), ("-infinity", f32::NEG_INFINITY)] {
         let mut rgb = vec![0.0; 3 * k.width * k.height];
         rgb[7] = value;
-        let view = ViewInput { rgb: &rgb, intrinsics: k, world_from_camera: glam::Affine3A::IDENTITY, time_sec: 0.0 };
+        let view = ViewInput {
+            rgb: &rgb,
+            intrinsics: k,
+            world_from_camera: glam::Affine3A::IDENTITY,
+            time_sec: 0.0,
+            valid: None,
+        };
         let batch = ClipBatch::from_views(&[vec![view]], PixelLayout::Hwc, 2.0, &Device::Cpu);
         sheet.add_refused(
             format!("{name} in a picture of floats"),

@@ -197,7 +197,7 @@ pub fn repainted(sets: &[PosedSet<Frame>], change: impl Fn(usize, usize, &[u8]) 
         for (c, frame) in set.frames.iter_mut().enumerate() {
             let old = &frame.item.rgb;
             let data = change(c, t, &old.data);
-            frame.item = Frame { rgb: Arc::new(RgbPicture { width: old.width, height: old.height, data }) };
+            frame.item.rgb = Arc::new(RgbPicture { width: old.width, height: old.height, data });
         }
     }
     sets

@@ -42,6 +42,11 @@ impl Reference {
         Self { width, height, planes: (0..CHANNELS).map(plane).collect() }
     }
 
+    /// Its value number `i`, in the layout it was made of.
+    pub fn value(&self, i: usize) -> f32 {
+        self.planes.get(i % CHANNELS).and_then(|plane| plane.values.get(i / CHANNELS)).copied().unwrap_or(0.0)
+    }
+
     /// The loss of `rgb01` (same layout as the reference's), and its gradient with respect to it.
     pub fn compare(&self, rgb01: &[f32]) -> (f64, Vec<f32>) {
         let count = rgb01.len().max(1) as f64;

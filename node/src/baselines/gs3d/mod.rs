@@ -8,6 +8,8 @@
 mod loss;
 mod params;
 
+use std::sync::Arc;
+
 use anyhow::{Result, ensure};
 use glam::Vec3;
 use storm_model::scene::Affine;
@@ -34,6 +36,8 @@ pub struct Target {
     pub sky: Vec<[f32; 3]>,
     /// Applied to the drawn colours.
     pub exposure: Affine,
+    /// Pixels to reproduce, row by row; none: all.
+    pub valid: Option<Arc<[bool]>>,
 }
 
 /// Hears the number of iterations done and the Gaussians then; false: enough.
@@ -90,7 +94,14 @@ impl Target {
             let shown = self.exposure.apply([0, 1, 2].map(|k| c[k] + gap * behind[k]));
             seen.extend(shown.map(|x| 0.5 * x + 0.5));
         }
-        let (loss, by_seen) = self.picture.compare(&seen);
+        let hidden = |i: usize| self.valid.as_ref().is_some_and(|valid| valid.get(i / 3) == Some(&false));
+        if self.valid.is_some() {
+            (0..seen.len()).filter(|&i| hidden(i)).for_each(|i| seen[i] = self.picture.value(i));
+        }
+        let (loss, mut by_seen) = self.picture.compare(&seen);
+        if self.valid.is_some() {
+            (0..seen.len()).filter(|&i| hidden(i)).for_each(|i| by_seen[i] = 0.0);
+        }
         let mut upstream =
             PictureGradient { features: Vec::with_capacity(features.len()), alpha: Vec::new(), depth: Vec::new() };
         let m = &self.exposure.matrix;
@@ -144,6 +155,7 @@ mod tests {
             picture: Reference::new(rgb, W, H),
             sky: Vec::new(),
             exposure: Affine::IDENTITY,
+            valid: None,
         };
         seen.iter().map(target).collect()
     }

@@ -233,7 +233,7 @@ impl Part {
         let mut dice = Dice::new(SEED + k as u64);
         for frame in &mut set.frames {
             frame.stamp_ns = set.stamp_ns;
-            frame.item = Frame { rgb: Arc::new(noisy(&frame.item.rgb, &mut dice)) };
+            frame.item.rgb = Arc::new(noisy(&frame.item.rgb, &mut dice));
         }
         (set, truth.clone())
     }

@@ -203,6 +203,7 @@ impl BagClips {
                     time_sec: seconds_between(first.0, frame.stamp_ns) as f32,
                     depth: depth.as_deref(),
                     sky: Some(sky.as_deref().unwrap_or(&self.ground[camera])),
+                    valid: frame.item.valid.as_deref(),
                 }
             };
             Ok(used.clone().map(view).collect())

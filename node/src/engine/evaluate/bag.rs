@@ -283,7 +283,8 @@ impl Cutter {
         let frames = self.sets.iter().filter(inside).map(|set| {
             let truth = self.cameras.iter().zip(&set.frames).enumerate().map(|(camera, (k, frame))| {
                 let known = self.truth.get(&(frame.stamp_ns, camera));
-                known.cloned().unwrap_or_else(|| TruthAt::none((k.width, k.height)))
+                let known = known.cloned().unwrap_or_else(|| TruthAt::none((k.width, k.height)));
+                known.seen(frame.item.valid.as_ref())
             });
             (set.clone(), truth.collect())
         });

@@ -12,12 +12,14 @@ use super::{Clip, Placed, Prediction};
 use crate::baselines::gs3d::{Params, Reference, Target, fit};
 use crate::engine::truth::unit;
 
-/// The context pictures: view in the window's frame, camera, colours of 0-1.
-fn pictures(clip: &Clip) -> Vec<(View, usize, Vec<f32>)> {
+/// A context picture: view in the window's frame, camera, colours of 0-1, and the pixels that show something.
+type Seen = (View, usize, Vec<f32>, Option<Arc<[bool]>>);
+
+fn pictures(clip: &Clip) -> Vec<Seen> {
     let mut out = Vec::new();
     for (step, set) in clip.window.steps.iter().enumerate() {
         for (camera, (view, frame)) in clip.views(step).into_iter().zip(&set.frames).enumerate() {
-            out.push((view, camera, unit(&frame.item.rgb.data)));
+            out.push((view, camera, unit(&frame.item.rgb.data), frame.item.valid.clone()));
         }
     }
     out
@@ -33,7 +35,7 @@ fn optimised(
     let mut targets = Vec::new();
     let mut raster = CpuRasterizer::new(start.raster_settings())?;
     let empty = Scene { gaussians: Gaussians::default(), affine: Vec::new(), ..start.clone() };
-    for (view, camera, rgb01) in pictures(clip) {
+    for (view, camera, rgb01, valid) in pictures(clip) {
         let (w, h) = (view.intrinsics.width, view.intrinsics.height);
         let sky = match &start.sky {
             None => Vec::new(),
@@ -41,7 +43,7 @@ fn optimised(
             Some(_) => empty.render(&mut raster, &[(view, None)], 0.0, Want::default())?.remove(0).color,
         };
         let exposure = start.affine.get(camera).copied().unwrap_or(Affine::IDENTITY);
-        targets.push(Target { view, picture: Reference::new(&rgb01, w, h), sky, exposure });
+        targets.push(Target { view, picture: Reference::new(&rgb01, w, h), sky, exposure, valid });
     }
     let settings = start.raster_settings();
     fit(&mut params, &targets, settings, iterations, clip.seed, &mut |done, _| {
@@ -64,7 +66,7 @@ pub(super) fn from_pictures(
     tick: &mut dyn FnMut(u64, u64),
 ) -> Result<Prediction> {
     let seen = pictures(clip);
-    let rays: Vec<(View, &[f32])> = seen.iter().map(|(view, _, rgb)| (*view, rgb.as_slice())).collect();
+    let rays: Vec<(View, &[f32])> = seen.iter().map(|(view, _, rgb, _)| (*view, rgb.as_slice())).collect();
     let params = Params::random(&rays, clip.seed);
     let size = clip.cameras.first().map_or((0, 0), |c| (c.width, c.height));
     let start = Scene {
@@ -76,6 +78,7 @@ pub(super) fn from_pictures(
             width: size.0,
         },
         depths: Vec::new(),
+        valid: Vec::new(),
         sky: None,
         affine: Vec::new(),
         motion_bases: Vec::new(),

@@ -58,7 +58,7 @@ pub(super) fn scene(clip: &Clip, config: &Arc<ModelConfig>, motion: Motion) -> O
                 g.means.push(unproject(view, i, z).to_array());
                 g.quats.push([rotation.w, rotation.x, rotation.y, rotation.z]);
                 g.scales.push([size[0], size[1], size[0].min(size[1])]);
-                g.opacities.push(1.0);
+                g.opacities.push(if truth.is_valid(i) { 1.0 } else { 0.0 });
                 g.colors.push([color[0], color[1], color[2]].map(|c| f32::from(c) / 127.5 - 1.0));
                 g.velocity_backward.push(velocity);
                 g.velocity_forward.push(velocity);
@@ -84,6 +84,7 @@ pub(super) fn scene(clip: &Clip, config: &Arc<ModelConfig>, motion: Motion) -> O
         gaussians: g,
         shape,
         depths,
+        valid: Vec::new(),
         sky: None,
         affine: Vec::new(),
         motion_bases,

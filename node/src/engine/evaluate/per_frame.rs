@@ -47,13 +47,17 @@ pub(super) fn scenes(clip: &Clip, engine: &mut Engine, which: Use) -> Result<Vec
 fn together(single: &[Placed], k: usize) -> Placed {
     let base = &single[k];
     let mut gaussians = Gaussians { motion_count: base.scene.gaussians.motion_count, ..Gaussians::default() };
-    let mut depths = Vec::new();
+    let masked = single.iter().any(|one| !one.scene.valid.is_empty());
+    let (mut depths, mut valid) = (Vec::new(), Vec::new());
     for other in single {
         append(&mut gaussians, &other.scene.gaussians, &relative(&base.map_from_anchor, &other.map_from_anchor));
         depths.extend_from_slice(&other.scene.depths);
+        if masked {
+            valid.extend((0..other.scene.shape.len()).map(|i| other.scene.is_valid(i)));
+        }
     }
     let shape = SceneShape { timesteps: single.len(), ..base.scene.shape };
-    let scene = Scene { gaussians, shape, depths, ..base.scene.clone() };
+    let scene = Scene { gaussians, shape, depths, valid, ..base.scene.clone() };
     Placed { stamp_ns: base.stamp_ns, map_from_anchor: base.map_from_anchor, scene, pixel_aligned: true }
 }
 

@@ -276,10 +276,10 @@ impl StepFlow {
 impl StepMask {
     fn add(&mut self, truth: &TruthAt, moves: impl Iterator<Item = bool>, groups: Option<&[u32]>) {
         let Some(moving) = &truth.moving else { return };
-        self.moves.extend(moves);
+        self.moves.extend(moves.enumerate().map(|(i, moves)| moves && truth.is_valid(i)));
         self.truly_moves.extend(moving.iter().map(|&m| m != 0));
         if let (Some(groups), Some(instance)) = (groups, &truth.instance) {
-            self.groups.extend_from_slice(groups);
+            self.groups.extend(groups.iter().enumerate().map(|(i, &group)| if truth.is_valid(i) { group } else { 0 }));
             let group = |(&id, &m): (&u16, &u16)| if m != 0 { u32::from(id) } else { 0 };
             self.true_groups.extend(instance.iter().zip(moving).map(group));
         }

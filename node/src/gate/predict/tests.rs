@@ -48,6 +48,7 @@ fn street(texture: f32, car_m: f32, car_mps: f32) -> Scene {
         shape: SceneShape { timesteps: 1, cameras: 1, height: 1, width: n },
         depths: vec![10.0; n],
         gaussians: g,
+        valid: Vec::new(),
         sky: None,
         affine: Vec::new(),
         motion_bases: Vec::new(),
@@ -79,7 +80,7 @@ fn picture(scene: &Scene, k: i64, paint: &dyn Fn(&mut RgbPicture)) -> RgbPicture
 
 fn window(k: i64, rgb: RgbPicture) -> Window<Frame> {
     let stamp_ns = k * HOP_NS;
-    let frame = PosedFrame { stamp_ns, map_from_camera: pose(k), item: Frame { rgb: Arc::new(rgb) } };
+    let frame = PosedFrame { stamp_ns, map_from_camera: pose(k), item: Frame::whole(rgb) };
     Window {
         epoch: 0,
         stamp_ns,

@@ -28,6 +28,7 @@ fn exposure_is_undone_before_colours_merge() {
             depths: vec![8.0; g.len()],
             gaussians: g,
             shape: SceneShape { timesteps: 1, cameras: 2, height: 24, width: 24 },
+            valid: Vec::new(),
             sky: None,
             affine: gains.map(gain).to_vec(),
             motion_bases: Vec::new(),

@@ -117,6 +117,7 @@ pub(crate) fn rig(cameras: usize) -> Arc<Rig> {
             info_topic: format!("/camera{i}/camera_info"),
             frame_id: Some("cam".into()),
             info: Some(CameraInfo::pinhole(&intrinsics, header(0))),
+            black_frame: None,
         })
         .collect();
     let tree = TfTree::new(&config.sync);

@@ -11,8 +11,8 @@ use crate::config::Config;
 use crate::engine::UNTRAINED;
 use crate::map::MapCloud;
 use crate::output::picture::{
-    DepthScale, Picture, TopView, depth_picture, flow_picture, mask_overlay, palette, top_view_picture, with_depth_bar,
-    with_flow_wheel,
+    DepthScale, Picture, TopView, depth_picture, flow_picture, hatched, mask_overlay, palette, top_view_picture,
+    with_depth_bar, with_flow_wheel,
 };
 use crate::output::report::{
     ErrorRow, ErrorTable, Panel, Report, ReportCamera, ReportFile, ReportStep, ReportTrack, StageTiming,
@@ -165,7 +165,11 @@ fn summary(m: &Metrics, rig: &Rig) -> Vec<(String, String)> {
     ];
     for (i, c) in rig.cameras.iter().enumerate() {
         let mark = if i == rig.reference { " (anchor)" } else { "" };
-        rows.push((format!("camera {i}{mark}"), c.topic.clone()));
+        let masked = match c.masked_share() {
+            share if share > 0.0 => format!("; {:.1} % of its pixels show nothing and take no part", 100.0 * share),
+            _ => String::new(),
+        };
+        rows.push((format!("camera {i}{mark}"), format!("{}{masked}", c.topic)));
     }
     rows.extend(m.problems.iter().map(|p| ("problem".to_string(), p.clone())));
     rows
@@ -193,28 +197,33 @@ fn report_step(step: &Shown, rig: &Rig) -> Result<ReportStep> {
     let mut cameras = Vec::new();
     for (c, view) in step.views.iter().enumerate() {
         let (w, h) = (view.width, view.height);
-        let input = Picture::from_rgb8(w, h, &step.inputs.frames[c].item.rgb.data)?;
+        let frame = &step.inputs.frames[c];
+        // What shows nothing is not there to be compared.
+        let shown =
+            |picture: Picture| frame.item.valid.as_ref().map_or(picture.clone(), |valid| hatched(&picture, valid));
+        let input = shown(Picture::from_rgb8(w, h, &frame.item.rgb.data)?);
         let rendered = Picture::from_rgb8(w, h, &view.rgb8())?;
         let still = vec![[0.0; 3]; w * h];
-        let flow = flow_picture(w, h, view.flow.as_deref().unwrap_or(&still), None, FULL_SPEED_MPS)?;
+        let flow = shown(flow_picture(w, h, view.flow.as_deref().unwrap_or(&still), None, FULL_SPEED_MPS)?);
         let mask: Vec<u16> = motion_mask(view).into_iter().map(u16::from).collect();
+        let hatching = if frame.item.valid.is_some() { "; hatched: shows nothing, takes no part" } else { "" };
         let panel = |title: &str, caption: String, picture| Panel { title: title.into(), caption, picture };
         cameras.push(ReportCamera {
             name: rig.cameras[c].topic.clone(),
             panels: vec![
-                panel("input", format!("{} ns", step.inputs.frames[c].stamp_ns), input),
-                panel("rendered", "the newest picture as the scene shows it".into(), rendered.clone()),
+                panel("input", format!("{} ns{hatching}", frame.stamp_ns), input),
+                panel("rendered", "the newest picture as the scene shows it".into(), shown(rendered.clone())),
                 panel(
                     "depth",
                     "z-depth, m, logarithmic".into(),
-                    with_depth_bar(&depth_picture(w, h, &depths[c], scale)?, scale),
+                    with_depth_bar(&shown(depth_picture(w, h, &depths[c], scale)?), scale),
                 ),
                 panel(
                     "flow",
                     "m/s; hue is direction in the ground plane".into(),
                     with_flow_wheel(&flow, FULL_SPEED_MPS),
                 ),
-                panel("mask", "moving pixels by motion group".into(), mask_overlay(&rendered, &mask)?),
+                panel("mask", "moving pixels by motion group".into(), shown(mask_overlay(&rendered, &mask)?)),
             ],
         });
     }

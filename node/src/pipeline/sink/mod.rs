@@ -24,6 +24,7 @@ use crate::output::ply::{PlyCloud, write_ply};
 use crate::output::tracks_csv::{TrackRow, TracksWriter};
 use crate::output::tum::write_tum;
 use crate::rigid::Rigid;
+use crate::source::rig::RigCamera;
 use crate::source::topics::TruthKind;
 use crate::source::{Frame, Rig};
 use crate::tracks::Track;
@@ -275,6 +276,7 @@ impl Sink {
             steps_skipped: finished.skips.skipped(),
             skips: finished.skips,
             dropped: counts.dropped,
+            masked_share: self.rig.cameras.iter().map(RigCamera::masked_share).collect(),
             messages_lost: counts.messages_lost,
             poses_rejected: counts.poses_rejected,
             non_finite_windows: counts.non_finite_windows,

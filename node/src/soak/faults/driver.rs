@@ -186,6 +186,7 @@ impl<'a> Car<'a> {
                 &c.intrinsics,
                 Header { stamp_ns: START_NS, frame_id: format!("camera{i}") },
             )),
+            black_frame: None,
         });
         let rig = Rig::build(described.collect(), &TfTree::new(&config.sync), "", &config.input, size)?;
         let rig = Arc::new(rig);

@@ -33,7 +33,7 @@ pub fn front(data: &[u8]) {
         true => Front::on_demand(&config, &rig, store),
         false => Front::new(&config, &rig, store),
     };
-    let frame = Frame { rgb: Arc::new(RgbPicture { width: 1, height: 1, data: vec![0; 3] }) };
+    let frame = Frame::whole(RgbPicture { width: 1, height: 1, data: vec![0; 3] });
     let mut out = VecDeque::new();
     let (mut now_ns, mut images, mut used) = (0i64, 0u64, 0u64);
     while !b.0.is_empty() {

@@ -173,6 +173,7 @@ fn rig() -> Arc<Rig> {
             info_topic: format!("/camera{i}/camera_info"),
             frame_id: Some("camera".into()),
             info: Some(CameraInfo::pinhole(&intrinsics, header())),
+            black_frame: None,
         });
         let mut config = Config::default();
         config.input.base_from_camera = vec![[0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5]; 2];
