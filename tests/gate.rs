@@ -50,7 +50,7 @@ impl Standing {
             let mut dice = Dice::new(k as u64);
             rgb.data.iter_mut().for_each(|x| *x = x.saturating_add((2.99 * dice.unit()) as u8).saturating_sub(1));
             paint(k, &mut rgb);
-            frame.item = Frame { rgb: Arc::new(rgb) };
+            frame.item = Frame { rgb: Arc::new(rgb), valid: None };
         }
         set
     }

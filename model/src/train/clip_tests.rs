@@ -156,7 +156,7 @@ fn variety_changes_lenses_and_cameras_and_nothing_else() {
 fn looks_change_colours_of_training_clips_only() {
     let config = ModelConfig::preset("tiny").unwrap();
     let usual = small();
-    let varied = ClipOptions { looks: LookOptions { sensor: true, ..LookOptions::default() }, ..usual };
+    let varied = ClipOptions { looks: LookOptions { sensor: true }, ..usual };
     assert_eq!(ClipPlan::of_drive(10_500, &varied), ClipPlan::of_drive(10_500, &usual), "validation is plain");
     let mut changed = 0;
     for k in 0..8 {

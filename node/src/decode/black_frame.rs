@@ -75,7 +75,7 @@ impl FrameFinder {
     /// Whether further images would change nothing, or enough were compared.
     pub fn settled(&self) -> bool {
         let (w, h) = self.size;
-        let border = |i: usize| i / w == 0 || i / w == h - 1 || i % w == 0 || i % w == w - 1;
+        let border = |i: usize| i / w == 0 || i / w == h - 1 || i.is_multiple_of(w) || i % w == w - 1;
         self.compared >= IMAGES
             || self.seen >= MOST_IMAGES
             || (self.compared > 0 && !(0..w * h).any(|i| border(i) && self.black[i]))

@@ -60,6 +60,8 @@ const UNSEEN: f32 = -1.0;
 pub(crate) struct Frame {
     /// Normalised colours, row by row, three numbers a cell.
     colors: Vec<f32>,
+    /// Whether the camera saw all of a cell's pixels; empty: it saw all of every cell.
+    valid: Vec<bool>,
     rows: usize,
     cols: usize,
     /// Focal lengths and principal point, cells.
@@ -69,9 +71,10 @@ pub(crate) struct Frame {
     time_sec: f32,
 }
 
-/// What a frame is made of: colours `(3, h, w)` in -1..1, intrinsics 3 x 3, pose 4 x 4 (row-major), seconds.
+/// What a frame is made of: colours `(3, h, w)` in -1..1, 1 where the camera saw something `(h, w)` (none: everywhere), intrinsics 3 x 3, pose 4 x 4 (row-major), seconds.
 pub(crate) struct Source<'a> {
     pub image: &'a [f32],
+    pub valid: Option<&'a [f32]>,
     pub size: [usize; 2],
     pub intrinsics: &'a [f32],
     pub pose: &'a [f32],
@@ -93,10 +96,17 @@ impl Frame {
                 }
             }
         }
+        let mut valid = vec![true; if source.valid.is_some() { rows * cols } else { 0 }];
+        for (y, line) in source.valid.iter().flat_map(|valid| valid.chunks_exact(w)).take(rows * side).enumerate() {
+            for (x, pixels) in line.chunks_exact(side).take(cols).enumerate() {
+                valid[y / side * cols + x] &= pixels.iter().all(|&x| x > 0.5);
+            }
+        }
         let (k, m) = (source.intrinsics, source.pose);
         let shrink = 1.0 / side as f32;
         Self {
             colors: normalised(&colors, rows, cols),
+            valid,
             rows,
             cols,
             focal: [k[0], k[4], k[2], k[5]].map(|x| x * shrink),
@@ -133,7 +143,12 @@ impl Frame {
             ((x as usize).min(self.cols.saturating_sub(2)), (y as usize).min(self.rows.saturating_sub(2)));
         let (u, v) = (x - left as f32, y - top as f32);
         let (step, line) = (if self.cols > 1 { 3 } else { 0 }, if self.rows > 1 { 3 * self.cols } else { 0 });
-        let first = 3 * (top * self.cols + left);
+        let seen = |i: usize| self.valid.get(i).copied().unwrap_or(true);
+        let corner = top * self.cols + left;
+        if !self.valid.is_empty() && ![0, step / 3, line / 3, (line + step) / 3].iter().all(|&by| seen(corner + by)) {
+            return UNSEEN;
+        }
+        let first = 3 * corner;
         let mut sum = 0.0;
         for (c, own) in color.into_iter().enumerate() {
             let pick = |at: usize| self.colors[at + c];
@@ -182,7 +197,8 @@ pub(crate) fn sweep(own: &Frame, depth: &[f32], distance_along_ray: bool, other:
     let moved = VELOCITIES.map(|[x, y]| other_from_world * Vec3::new(x, y, 0.0) * dt);
     let [fx, fy, cx, cy] = own.focal;
     let mut errors = vec![UNSEEN; rows * cols * CANDIDATES];
-    for (cell, out) in errors.chunks_exact_mut(CANDIDATES).enumerate() {
+    let seen = |cell: usize| own.valid.get(cell).copied().unwrap_or(true);
+    for (cell, out) in errors.chunks_exact_mut(CANDIDATES).enumerate().filter(|(cell, _)| seen(*cell)) {
         let (x, y) = ((cell % cols) as f32 + 0.5, (cell / cols) as f32 + 0.5);
         let mut ray = Vec3::new((x - cx) / fx, (y - cy) / fy, 1.0);
         if distance_along_ray {
@@ -247,7 +263,7 @@ mod tests {
 
     fn frame(shift_px: f32, gain: f32, time_sec: f32) -> Frame {
         let image = image(shift_px, gain);
-        Frame::new(&Source { image: &image, size: SIZE, intrinsics: &K, pose: &POSE, time_sec }, 2)
+        Frame::new(&Source { image: &image, valid: None, size: SIZE, intrinsics: &K, pose: &POSE, time_sec }, 2)
     }
 
     #[test]
@@ -265,6 +281,31 @@ mod tests {
             assert!(row.iter().all(|s| (0.0..=1.0).contains(s)));
         }
         assert!(right * 10 > inner.len() * 9, "{right} of {}", inner.len());
+    }
+
+    #[test]
+    fn what_the_camera_did_not_see_is_neither_looked_for_nor_found() {
+        // The left half of both images shows nothing; whatever stands there.
+        let [h, w] = SIZE;
+        let valid: Vec<f32> = (0..h * w).map(|i| if i % w < w / 2 { 0.0 } else { 1.0 }).collect();
+        let frame = |unseen: f32, time_sec: f32| {
+            let mut image = image(0.0, 1.0);
+            image.iter_mut().enumerate().filter(|(i, _)| i % w < w / 2).for_each(|(_, x)| *x = unseen);
+            let source =
+                Source { image: &image, valid: Some(&valid), size: SIZE, intrinsics: &K, pose: &POSE, time_sec };
+            Frame::new(&source, 2)
+        };
+        let scores = sweep(&frame(0.3, 0.0), &vec![10.0; 12 * 24], false, &frame(0.3, 0.5));
+        let left = VELOCITIES.iter().position(|v| *v == [0.0, 9.0]).unwrap();
+        for (cell, row) in scores.chunks_exact(CANDIDATES).enumerate() {
+            if cell % 24 < 12 {
+                assert!(row.iter().all(|s| *s == 0.0), "cell {cell}");
+            } else {
+                assert!(row[0] > 0.999);
+            }
+            // 9 m/s to the left for half a second at 10 m: 9 cells, so out of what was seen from the nearer ones.
+            assert!(!(12..20).contains(&(cell % 24)) || row[left] == 0.0, "cell {cell}");
+        }
     }
 
     #[test]

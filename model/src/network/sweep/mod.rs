@@ -91,9 +91,11 @@ fn frames(batch: &ClipBatch, side: usize) -> Result<Vec<Frame>, ModelError> {
     let [_, _, _, h, w] = batch.dims()?;
     let (images, ks, poses) = (host(&batch.image)?, host(&batch.intrinsics)?, host(&batch.world_from_camera)?);
     let times = host(&batch.time_sec)?;
+    let valid = batch.valid.as_ref().map(host).transpose()?;
     let view = |(i, &time_sec): (usize, &f32)| {
         let source = Source {
             image: &images[i * 3 * h * w..(i + 1) * 3 * h * w],
+            valid: valid.as_ref().map(|valid| &valid[i * h * w..(i + 1) * h * w]),
             size: [h, w],
             intrinsics: &ks[9 * i..9 * i + 9],
             pose: &poses[16 * i..16 * i + 16],

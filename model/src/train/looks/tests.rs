@@ -20,7 +20,7 @@ fn shutter(drive: &Drive, open_sec: f64) -> Shutter {
 
 #[test]
 fn names_are_read_and_written_and_wrong_ones_refused() {
-    for looks in [LookOptions::default(), LookOptions::varied(), LookOptions { sensor: true, ..Default::default() }] {
+    for looks in [LookOptions::default(), LookOptions::varied(), LookOptions { sensor: true }] {
         assert_eq!(LookOptions::parse(&looks.describe()), Ok(looks));
     }
     assert_eq!(LookOptions::default().describe(), "plain");

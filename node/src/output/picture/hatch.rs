@@ -12,7 +12,7 @@ const STRIPE_PX: usize = 2;
 pub fn hatched(picture: &Picture, valid: &[bool]) -> Picture {
     let width = picture.width();
     Picture::from_fn(width, picture.height(), |col, row| {
-        let stripe = if (col + row) / STRIPE_PX % 2 == 0 { LIGHT } else { DARK };
+        let stripe = if ((col + row) / STRIPE_PX).is_multiple_of(2) { LIGHT } else { DARK };
         match valid.get(row * width + col) {
             Some(false) => stripe,
             _ => picture.get(col, row).unwrap_or(stripe),

@@ -48,7 +48,7 @@ fn run(clip: &Clip, window: Window<Frame>) -> Left {
 
 #[test]
 fn what_stands_in_masked_pixels_reaches_nothing() {
-    let clip = Clip::of_seed(3, SIZE).unwrap();
+    let clip = Clip::of_seed(3, SIZE, 0.0).unwrap();
     let noise = |i: usize, t: usize| ((i * 31 + t * 97) % 251) as u8;
     let (black, other) = (run(&clip, window(&clip, true, &|_, _| 0)), run(&clip, window(&clip, true, &noise)));
     assert_eq!(black.flow, other.flow);
@@ -69,7 +69,7 @@ fn what_stands_in_masked_pixels_reaches_nothing() {
 
 #[test]
 fn masked_pixels_have_no_gaussians_and_are_no_sky() {
-    let clip = Clip::of_seed(4, SIZE).unwrap();
+    let clip = Clip::of_seed(4, SIZE, 0.0).unwrap();
     let left = run(&clip, window(&clip, true, &|_, _| 90));
     let (scene, pixels) = (&left.scene, SIZE.0 * SIZE.1);
     for i in 0..scene.shape.len() {
@@ -81,7 +81,7 @@ fn masked_pixels_have_no_gaussians_and_are_no_sky() {
 
 #[test]
 fn a_mask_that_hides_nothing_gives_the_same_bytes() {
-    let clip = Clip::of_seed(3, SIZE).unwrap();
+    let clip = Clip::of_seed(3, SIZE, 0.0).unwrap();
     let mut marked = clip.window.clone();
     let valid: Arc<[bool]> = vec![true; SIZE.0 * SIZE.1].into();
     for set in &mut marked.steps {

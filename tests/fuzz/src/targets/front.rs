@@ -1,7 +1,6 @@
 //! Events through synchronisation, poses and windows.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
 use storm_node::config::Config;
