@@ -92,12 +92,14 @@ impl ModelConfig {
             upsampler_widths: vec![96, 64, 32],
             key_hidden: 64,
             basis_hidden: 64,
+            // What its weights were trained to be drawn with.
+            screen_blur_px2: 0.3,
             ..Self::small_budget()
         }
     }
 
     fn base() -> Self {
-        Self { patch_size: 16, image_height: 160, image_width: 240, ..Self::tiny() }
+        Self { patch_size: 16, image_height: 160, image_width: 240, screen_blur_px2: 0.1, ..Self::tiny() }
     }
 
     /// Choices that let a network of a few million parameters start from a useful point.
