@@ -74,6 +74,16 @@ pub struct CameraInfo {
 }
 
 impl CameraInfo {
+    /// True when `K` holds no focal length: the camera is not calibrated, or `P` alone describes it.
+    pub fn k_is_unset(&self) -> bool {
+        self.k[0] == 0.0 && self.k[4] == 0.0
+    }
+
+    /// True when `P` holds no focal length (some drivers write nothing but its last 1).
+    pub fn p_is_unset(&self) -> bool {
+        self.p[0] == 0.0 && self.p[5] == 0.0
+    }
+
     /// Of an undistorted picture.
     ///
     /// ROS follows OpenCV, where the centre of the first pixel is 0.0; ours puts it at 0.5, so the principal point moves by

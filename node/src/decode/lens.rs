@@ -8,8 +8,10 @@ use super::error::DecodeError;
 use crate::msg::CameraInfo;
 
 /// Models [`Lens::from_info`] knows.
-pub const MODELS: &str = "plumb_bob (4 or 5 coefficients), rational_polynomial (8, or 12 with thin prism), \
-     equidistant or fisheye (4), none (empty)";
+pub const MODELS: &str = "plumb_bob or rational_polynomial (4, 5, 8, or 12 with thin prism coefficients), \
+     equidistant or fisheye (4), any other name when all coefficients are zero";
+/// Parts of names of models that are no pinhole without coefficients either.
+const WIDE_MODELS: [&str; 6] = ["fish", "kannala", "sphere", "unified", "omni", "ftheta"];
 
 /// How far out (tangent of the ray's angle, or the angle itself) the search for a model's fold goes; tan 86.4 degrees.
 const FOLD_SEARCH_END: f64 = 16.0;
@@ -53,15 +55,19 @@ impl Lens {
         }
         let unknown = |found: String| Err(DecodeError::Model { found, accepted: MODELS });
         let known = match model {
-            "plumb_bob" => [0, 4, 5, 5],
-            "rational_polynomial" => [0, 5, 8, 12],
-            "equidistant" | "fisheye" => [0, 4, 4, 4],
-            "" | "none" => [0, 0, 0, 0],
-            _ => return unknown(model.to_owned()),
+            // OpenCV tells these two apart by the number of coefficients alone, and so do the tools built on it.
+            "plumb_bob" | "rational_polynomial" => &[0, 4, 5, 8, 12][..],
+            "equidistant" | "fisheye" => &[0, 4],
+            _ if d.iter().any(|x| *x != 0.0) => return unknown(model.to_owned()),
+            _ if WIDE_MODELS.iter().any(|part| model.to_ascii_lowercase().contains(part)) => {
+                return unknown(model.to_owned());
+            }
+            // Whatever the model is called, a lens whose coefficients are all zero does nothing.
+            _ => return Ok(Self::Pinhole),
         };
         // Some drivers pad with zeros: only coefficients that do something count.
         let used = d.iter().rposition(|x| *x != 0.0).map_or(0, |last| last + 1);
-        let most = known.into_iter().max().unwrap_or(0);
+        let most = known.iter().copied().max().unwrap_or(0);
         if used > most || (used > 0 && !known.contains(&d.len()) && d.len() < most) {
             return unknown(format!("{model}` with {} coefficients `{d:?}", d.len()));
         }
@@ -214,7 +220,12 @@ mod tests {
         for (model, d, says) in [
             ("thin_prism_fisheye", &[0.1][..], "`thin_prism_fisheye`"),
             ("plumb_bob", &[0.1, 0.2, 0.3][..], "`plumb_bob` with 3 coefficients"),
-            ("plumb_bob", &[0.1, 0.2, 0.0, 0.0, 0.0, 0.4, 0.0, 0.0], "with 8 coefficients"),
+            ("plumb_bob", &[0.1, 0.2, 0.0, 0.0, 0.0, 0.4, 0.0], "with 7 coefficients"),
+            ("rational_polynomial", &[0.1; 14], "with 14 coefficients"),
+            ("equidistant", &[0.1, 0.2], "with 2 coefficients"),
+            ("equidistant", &[0.1, 0.0, 0.0, 0.0, 0.2], "with 5 coefficients"),
+            ("double_sphere", &[0.0; 5], "`double_sphere`"),
+            ("kannala_brandt8", &[], "`kannala_brandt8`"),
             ("", &[0.1, 0.0, 0.0, 0.0], "``"),
         ] {
             let e = Lens::from_info(&info(model, d)).unwrap_err().to_string();
@@ -222,11 +233,24 @@ mod tests {
         }
         let e = Lens::from_info(&info("plumb_bob", &[f64::NAN; 5])).unwrap_err().to_string();
         assert!(e.contains("NaN is not finite"), "{e}");
-        for (model, d) in
-            [("plumb_bob", &[0.0; 5][..]), ("plumb_bob", &[]), ("", &[]), ("rational_polynomial", &[0.0; 14])]
-        {
+        for (model, d) in [
+            ("plumb_bob", &[0.0; 5][..]),
+            ("plumb_bob", &[]),
+            ("", &[]),
+            ("rational_polynomial", &[0.0; 14]),
+            ("pinhole", &[0.0; 5]),
+            ("perspective", &[]),
+        ] {
             assert_eq!(Lens::from_info(&info(model, d)).unwrap(), Lens::Pinhole);
         }
+        let rational =
+            Lens::from_info(&info("rational_polynomial", &[0.1, 0.2, 0.0, 0.0, 0.0, 0.4, 0.0, 0.0])).unwrap();
+        assert_eq!(Lens::from_info(&info("plumb_bob", &[0.1, 0.2, 0.0, 0.0, 0.0, 0.4, 0.0, 0.0])).unwrap(), rational);
+        let long = [0.08, -0.03, 0.012, -0.002, 0.0, 0.0];
+        assert_eq!(
+            Lens::from_info(&info("equidistant", &long)).unwrap(),
+            Lens::Equidistant { k: [0.08, -0.03, 0.012, -0.002] }
+        );
         assert!(Lens::from_info(&info("plumb_bob", &[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])).is_ok());
     }
 

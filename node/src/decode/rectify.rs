@@ -22,6 +22,8 @@ const MAX_OUTPUT_SIDE: usize = 8192;
 const ROTATION_TOLERANCE: f64 = 1e-3;
 /// Rotations below this (radians) move no pixel of a 10,000-pixel camera by a tenth.
 const NO_ROTATION_RAD: f64 = 1e-6;
+/// A skew that moves no pixel of the picture by more than this is taken for rounding, pixels.
+const NO_SKEW_PX: f64 = 0.01;
 
 /// A pinhole in f64; pixel centres at +0.5.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,13 +66,20 @@ impl Rectifier {
             return Err(wrong(format!("output size {width}x{height} is not within 1..={MAX_OUTPUT_SIDE}")));
         }
         let window = Window::of(info).map_err(wrong)?;
-        let has_p = info.p.iter().any(|x| *x != 0.0);
+        let has_p = !info.p_is_unset();
         let from_p = || window.camera("P", [info.p[0], info.p[1], info.p[2], info.p[4], info.p[5], info.p[6]]);
         let from_k = || window.camera("K", [info.k[0], info.k[1], info.k[2], info.k[3], info.k[4], info.k[5]]);
         let rectified = if has_p { from_p() } else { from_k() }.map_err(wrong)?;
         let (raw, lens, rectified_from_camera) = if already_rectified {
             (rectified, Lens::Pinhole, None)
         } else {
+            if info.k_is_unset() && has_p {
+                return Err(wrong(
+                    "K is zero, so its distortion cannot be undone; set input.rectified to true if its pictures are \
+                     rectified already"
+                        .into(),
+                ));
+            }
             let rotation = if has_p { rotation(&info.r).map_err(wrong)? } else { None };
             (from_k().map_err(wrong)?, Lens::from_info(info)?, rotation)
         };
@@ -184,6 +193,8 @@ struct Window {
     binning_y: f64,
     width: usize,
     height: usize,
+    full_width: f64,
+    full_height: f64,
 }
 
 impl Window {
@@ -206,11 +217,13 @@ impl Window {
             return Err(format!("binning {binning_x}x{binning_y} leaves nothing of {width}x{height}"));
         }
         let (binning_x, binning_y) = (f64::from(binning_x), f64::from(binning_y));
-        Ok(Self { x: x.into(), y: y.into(), binning_x, binning_y, width: w as usize, height: h as usize })
+        let (full_width, full_height) = (full_w.into(), full_h.into());
+        let (width, height) = (w as usize, h as usize);
+        Ok(Self { x: x.into(), y: y.into(), binning_x, binning_y, width, height, full_width, full_height })
     }
 
     /// The pinhole of two matrix rows `[fx, skew, cx, _, fy, cy]` given for the full picture in OpenCV's convention.
-    fn camera(&self, name: &str, [fx, skew, cx, _, fy, cy]: [f64; 6]) -> Result<Pinhole, String> {
+    fn camera(&self, name: &str, [fx, skew, cx, turned_skew, fy, cy]: [f64; 6]) -> Result<Pinhole, String> {
         if fx == 0.0 && fy == 0.0 {
             return Err(format!("the camera is not calibrated ({name} is zero)"));
         }
@@ -218,8 +231,13 @@ impl Window {
         if !usable {
             return Err(format!("{name} is not a camera: fx {fx}, fy {fy}, cx {cx}, cy {cy}"));
         }
-        if skew != 0.0 {
-            return Err(format!("{name} has skew {skew}; only cameras without skew are accepted"));
+        // The farthest a pixel moves: by x of a skew times y of the normalised plane, and the other way about.
+        let (rows, columns) = (self.full_height / fy, self.full_width / fx);
+        for (skew, reach) in [(skew, rows), (turned_skew, columns)] {
+            let is_rounding = (skew * reach).abs() <= NO_SKEW_PX;
+            if !is_rounding {
+                return Err(format!("{name} has skew {skew}; only cameras without skew are accepted"));
+            }
         }
         Ok(Pinhole {
             fx: fx / self.binning_x,

@@ -218,6 +218,25 @@ fn cameras_that_are_none_are_refused_with_the_value() {
     let mut skewed = good.clone();
     skewed.k[1] = 3.0;
     says(&skewed, 8, 8, "skew 3");
+    skewed.k[1] = f64::NAN;
+    says(&skewed, 8, 8, "skew NaN");
+    skewed.k[1] = 0.0;
+    skewed.k[3] = -2.0;
+    says(&skewed, 8, 8, "skew -2");
+    // What a solver leaves behind is none: 2.8e-14 moves no pixel.
+    let mut rounding = with_p(good.clone(), DQuat::IDENTITY);
+    (rounding.p[1], rounding.k[1]) = (-2.842_170_943_040_401e-14, 1e-9);
+    let exact = Rectifier::new(&with_p(good.clone(), DQuat::IDENTITY), false, 8, 8).unwrap();
+    assert_eq!(Rectifier::new(&rounding, false, 8, 8).unwrap().intrinsics(), exact.intrinsics());
+    // P alone describes rectified pictures; raw ones want K.
+    let no_k = CameraInfo { k: [0.0; 9], ..with_p(good.clone(), DQuat::IDENTITY) };
+    assert_eq!(Rectifier::new(&no_k, true, 8, 8).unwrap().intrinsics(), exact.intrinsics());
+    says(&no_k, 8, 8, "input.rectified");
+    // A P with nothing but its last 1 is unset.
+    let mut no_p = good.clone();
+    no_p.p[10] = 1.0;
+    let plain = Rectifier::new(&good, false, 8, 8).unwrap();
+    assert_eq!(Rectifier::new(&no_p, false, 8, 8).unwrap().intrinsics(), plain.intrinsics());
 
     let r = Rectifier::new(&good, false, 8, 8).unwrap();
     let e = r.apply(&RgbPicture { width: 320, height: 200, data: vec![0; 192_000] }).unwrap_err().to_string();
@@ -310,4 +329,53 @@ proptest! {
             }
         }
     }
+}
+
+proptest! {
+    /// Region of interest and binning against the definition: a ray's pixel under the full picture's P, cut out and scaled.
+    #[test]
+    fn rays_land_where_window_and_binning_put_them(
+        x in 0u32..300, y in 0u32..200, cut_w in 60u32..300, cut_h in 60u32..200, bx in 1u32..5, by in 1u32..5,
+        out in (8usize..300, 8usize..300), ray in (-0.6..0.6f64, -0.4..0.4f64), whole in any::<bool>(), already in any::<bool>(),
+    ) {
+        let mut info = with_p(camera("plumb_bob", &[-0.2, 0.05, 0.0, 0.0, 0.0]), DQuat::from_rotation_y(0.02));
+        info.roi = if whole { [0; 4] } else { [x, y, cut_h, cut_w] };
+        (info.binning_x, info.binning_y) = (bx, by);
+        let (x, y, w, h) = if whole { (0, 0, WIDTH as u32, HEIGHT as u32) } else { (x, y, cut_w, cut_h) };
+        let r = Rectifier::new(&info, already, out.0, out.1).unwrap();
+        prop_assert_eq!(r.source_size(), ((w / bx) as usize, (h / by) as usize));
+        let k = r.intrinsics();
+        let at = |p: f64, c: f64, ray: f64, start: u32, binning: u32, size: usize, source: usize| {
+            // OpenCV's pixel centres are whole numbers, ours lie half a pixel on.
+            (p * ray + c + 0.5 - f64::from(start)) / f64::from(binning) * size as f64 / source as f64
+        };
+        let want = (
+            at(info.p[0], info.p[2], ray.0, x, bx, out.0, r.source_size().0),
+            at(info.p[5], info.p[6], ray.1, y, by, out.1, r.source_size().1),
+        );
+        let got = (f64::from(k.fx) * ray.0 + f64::from(k.cx), f64::from(k.fy) * ray.1 + f64::from(k.cy));
+        prop_assert!((got.0 - want.0).abs() < 1e-3 && (got.1 - want.1).abs() < 1e-3, "{:?} {:?}", got, want);
+    }
+}
+
+/// Cut first or rectify first: the same picture where both see it.
+#[test]
+fn a_cut_picture_is_rectified_as_its_part_of_the_whole() {
+    let turn = DQuat::from_euler(glam::EulerRot::ZYX, 0.01, -0.02, 0.015);
+    let whole = with_p(camera("plumb_bob", &[-0.22, 0.06, 0.0011, -0.0013, -0.005]), turn);
+    let photo = photograph(&whole, turn);
+    let [x, y, h, w] = [96usize, 48, 280, 420];
+    let cut = CameraInfo { roi: [x as u32, y as u32, h as u32, w as u32], ..whole.clone() };
+    let rows = (y..y + h).flat_map(|row| photo.data[(row * WIDTH + x) * 3..(row * WIDTH + x + w) * 3].iter().copied());
+    let part = RgbPicture { width: w, height: h, data: rows.collect() };
+    let all = Rectifier::new(&whole, false, WIDTH, HEIGHT).unwrap().apply(&photo).unwrap();
+    let got = Rectifier::new(&cut, false, w, h).unwrap().apply(&part).unwrap();
+    let mut compared = 0;
+    // Away from the cut's border, beyond which only the whole picture sees.
+    for (row, col) in (30..h - 30).flat_map(|row| (40..w - 40).map(move |col| (row, col))) {
+        let (a, b) = (got.data[(row * w + col) * 3], all.data[((row + y) * WIDTH + col + x) * 3]);
+        assert!(a.abs_diff(b) <= 1, "{row} {col}: {a} {b}");
+        compared += 1;
+    }
+    assert!(compared > 70_000);
 }
