@@ -7,8 +7,8 @@ use anyhow::{Context, Result};
 use super::Outcome;
 use crate::bag::Bag;
 use crate::config::Config;
-use crate::source::bag::plan_of;
-use crate::source::topics::PoseTopic;
+use crate::engine::ModelSource;
+use crate::source::bag::BagSource;
 
 /// Arguments of `storm info`.
 #[derive(Debug, clap::Args)]
@@ -37,17 +37,16 @@ pub fn run(args: &Args) -> Result<Outcome> {
     }
     let problems = bag.problems();
     problems.iter().for_each(|p| say!("problem: {p}"));
-    let plan = plan_of(&bag, &config.input)?;
-    for (i, c) in plan.cameras.iter().enumerate() {
-        say!("camera {i}: {} with {}", c.name, bag.topics()[c.info].name);
-    }
+    drop(bag);
+    let size = ModelSource::open(&config.model)?.picture_size(&config.model)?;
+    let source = BagSource::open(&args.bag, &config, size)?;
+    let (rig, plan) = (source.rig(), source.plan());
+    rig.lines(size).iter().for_each(|line| say!("{line}"));
     for left_out in &plan.left_out {
         say!("no camera: {left_out}");
     }
-    match plan.pose {
-        PoseTopic::Message(t) => say!("pose: {}", bag.topics()[t].name),
-        PoseTopic::Tf => say!("pose: /tf, {} from the vehicle frame", config.input.map_frame),
-    }
+    say!("{}", source.pose_line());
+    rig.warnings().iter().for_each(|line| say!("warning: {line}"));
     say!("ground truth: {} topics", plan.truth.len());
     Ok(if problems.is_empty() { Outcome::Done } else { Outcome::Lost })
 }

@@ -6,12 +6,14 @@
 mod docs;
 mod file;
 mod parameters;
+mod rectified;
 mod section;
 mod validate;
 
 pub use file::ConfigError;
 pub(crate) use file::nests_too_deep;
 pub use parameters::RUN_TIME;
+pub use rectified::RectifiedSetting;
 pub use section::ParameterDoc;
 use section::section;
 use serde::{Deserialize, Serialize};
@@ -25,18 +27,18 @@ section! {
         camera_infos: Vec<String> = Vec::new(),
         /// Pose topic (PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped or TFMessage); empty: found by type.
         pose: String = String::new(),
-        /// Fixed frame of the poses; used with TF, and to name the map frame in the outputs.
-        map_frame: String = "map".into(),
+        /// Fixed frame of the outputs; empty: the frame the pose message is given in, with TF `map`, else `odom`, else the tree's root. Another frame than the pose's must be connected to it by /tf.
+        map_frame: String = String::new(),
         /// Vehicle frame; empty: the pose message's child frame, else `base_link`.
         base_frame: String = String::new(),
-        /// Camera mounting, one entry per camera: x y z (m) then qw qx qy qz, optical frame in the vehicle frame; empty: from /tf_static.
+        /// Camera mounting, one entry per camera: x y z (m) then qw qx qy qz, optical frame in the vehicle frame; empty: from /tf_static, /tf (joints) or P (stereo); the camera's own frame where the pose is of it.
         base_from_camera: Vec<[f64; 7]> = Vec::new(),
         /// Camera the window is anchored at; -1: the one that looks most nearly along the vehicle's x axis.
         reference_camera: i64 = -1,
         /// Constant added to each camera's stamps, seconds; empty: none.
         image_time_offset_sec: Vec<f64> = Vec::new(),
-        /// Whether images are rectified already: `auto` (the topic name says so), `yes`, `no`.
-        rectified: String = "auto".into(),
+        /// Whether images are rectified already: `auto` (the last part of the topic's name says so, else the CameraInfo), `true`, `false`; or a list with one of them per camera.
+        rectified: RectifiedSetting = RectifiedSetting::default(),
         /// Parts of images to ignore, such as the vehicle's own bonnet: entries `CAMERA=FILE` with the camera's number or image topic and a picture of any size, black where to ignore.
         masks: Vec<String> = Vec::new(),
         /// Whether a constant black frame around a camera's images (left by a driver's own rectification, or around a fisheye's circle) is looked for and left out.

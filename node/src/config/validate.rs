@@ -99,7 +99,6 @@ impl Config {
         one_of("live.transport", &self.live.transport, &["auto", "raw", "compressed"])?;
         one_of("live.map", &self.live.map, &["auto", "always", "never"])?;
         one_of("live.reliability", &self.live.reliability, &["sensor_data", "reliable"])?;
-        one_of("input.rectified", &self.input.rectified, &["auto", "yes", "no"])?;
         one_of("model.precision", &self.model.precision, &Precision::ALL.map(|(_, name)| name))?;
         between("model.sweep_prior_sec", self.model.sweep_prior_sec, 0.0, 1.0)?;
         one_of("model.device", &self.model.device, &["cpu", "cuda", "metal"])?;
@@ -124,6 +123,9 @@ impl Config {
             }
         }
         let cameras = self.input.images.len();
+        if self.input.rectified.values() != 1 {
+            same_length("input.rectified", self.input.rectified.values(), cameras)?;
+        }
         same_length("input.camera_infos", self.input.camera_infos.len(), cameras)?;
         same_length("input.base_from_camera", self.input.base_from_camera.len(), cameras)?;
         same_length("input.image_time_offset_sec", self.input.image_time_offset_sec.len(), cameras)?;

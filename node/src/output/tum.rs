@@ -31,9 +31,19 @@ fn stamp_from_text(text: &str) -> Option<i64> {
     whole.parse::<i64>().ok()?.checked_mul(1_000_000_000)?.checked_add(nanos).map(|ns| sign * ns)
 }
 
-/// Writes poses (`map_from_base`, metres) in the order given. Errors on a pose that is not finite.
-pub fn write_tum(path: &Path, poses: impl IntoIterator<Item = (i64, Rigid)>) -> Result<(), OutputError> {
+/// Writes poses (`frame` from `of`, metres) in the order given, below a comment that names the frames. Errors on a pose that
+/// is not finite.
+pub fn write_tum(
+    path: &Path,
+    frame: &str,
+    of: &str,
+    poses: impl IntoIterator<Item = (i64, Rigid)>,
+) -> Result<(), OutputError> {
+    // A line break in a frame's name would end the comment.
+    let name = |frame: &str| frame.replace(char::is_control, " ");
     write_atomic(path, |out| {
+        writeln!(out, "# {} in {}: timestamp tx ty tz qx qy qz qw", name(of), name(frame))
+            .map_err(OutputError::io(path))?;
         for (index, (stamp_ns, pose)) in poses.into_iter().enumerate() {
             let (t, q) = (pose.translation, pose.rotation);
             if let Some(value) = [t.x, t.y, t.z, q.x, q.y, q.z, q.w].into_iter().find(|v| !v.is_finite()) {
@@ -78,15 +88,16 @@ mod tests {
         let path = dir.path().join("t.tum");
         let pose =
             Rigid::new(DQuat::from_rotation_z(0.7), DVec3::new(691_234.123_456_789_1, 5_334_000.000_000_001, 1e-7));
-        write_tum(&path, [(1_700_000_000_123_456_789, pose), (-1, Rigid::IDENTITY)]).unwrap();
+        write_tum(&path, "map", "base_link", [(1_700_000_000_123_456_789, pose), (-1, Rigid::IDENTITY)]).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
-        let lines: Vec<Vec<&str>> = text.lines().map(|l| l.split(' ').collect()).collect();
+        assert_eq!(text.lines().next(), Some("# base_link in map: timestamp tx ty tz qx qy qz qw"));
+        let lines: Vec<Vec<&str>> = text.lines().skip(1).map(|l| l.split(' ').collect()).collect();
         assert_eq!(lines[0][0], "1700000000.123456789");
         assert_eq!(lines[1][0], "-0.000000001");
         let numbers: Vec<f64> = lines[0][1..].iter().map(|s| s.parse().unwrap()).collect();
         let (t, q) = (pose.translation, pose.rotation);
         assert_eq!(numbers, [t.x, t.y, t.z, q.x, q.y, q.z, q.w]);
-        assert!(!text.contains('e'), "exponents trip simple readers");
+        assert!(!text.lines().skip(1).any(|l| l.contains('e')), "exponents trip simple readers");
         let back = read_tum(&path).unwrap();
         assert_eq!((back[0].0, back[0].1.translation), (1_700_000_000_123_456_789, pose.translation));
         assert_eq!(back[1].0, -1);
@@ -119,7 +130,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.tum");
         let bad = Rigid::new(DQuat::IDENTITY, DVec3::new(0.0, f64::NAN, 0.0));
-        assert!(matches!(write_tum(&path, [(0, bad)]), Err(OutputError::NonFinite { index: 0, .. })));
+        assert!(matches!(
+            write_tum(&path, "map", "base_link", [(0, bad)]),
+            Err(OutputError::NonFinite { index: 0, .. })
+        ));
         assert!(!path.exists());
     }
 }

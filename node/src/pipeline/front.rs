@@ -106,11 +106,12 @@ impl Front {
     pub fn with_cameras(self, config: &Config, rig: &Rig, active: &[usize]) -> Self {
         let offsets: Vec<f64> =
             active.iter().map(|&c| config.input.image_time_offset_sec.get(c).copied().unwrap_or(0.0)).collect();
-        let mounts: Vec<Rigid> = active.iter().map(|&c| rig.cameras[c].base_from_camera).collect();
+        let places: Vec<Rigid> = active.iter().map(|&c| rig.cameras[c].base_from_camera).collect();
+        let mounts = active.iter().map(|&c| rig.cameras[c].mount.clone()).collect();
         let reference = active
             .iter()
             .position(|&c| c == rig.reference)
-            .or_else(|| extrinsics::reference_camera(&mounts))
+            .or_else(|| extrinsics::reference_camera(&places))
             .unwrap_or(0);
         let place = |c: &usize| self.active.iter().position(|a| a == c);
         let kept: Option<Vec<usize>> = active.iter().map(place).collect();
@@ -306,8 +307,8 @@ impl Front {
     }
 
     /// The pose stage, for turning camera poses into vehicle poses.
-    pub fn base_pose(&self, camera: usize, map_from_camera: &Rigid) -> Rigid {
-        self.posed.base_pose(camera, map_from_camera)
+    pub fn base_pose(&self, camera: usize, stamp_ns: i64, map_from_camera: &Rigid) -> Rigid {
+        self.posed.base_pose(camera, stamp_ns, map_from_camera)
     }
 }
 

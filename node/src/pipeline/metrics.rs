@@ -121,6 +121,10 @@ pub struct Metrics {
     pub overlap: OverlapCounts,
     /// Windows per forward pass of the network.
     pub batch: usize,
+    /// Fixed frame of all outputs.
+    pub map_frame: String,
+    /// Vehicle frame.
+    pub base_frame: String,
     /// What `map.ply` is relative to, map frame, metres.
     pub origin_m: [f64; 3],
     /// Times the clock jumped or the recording looped.

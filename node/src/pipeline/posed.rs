@@ -8,6 +8,7 @@ use crate::poses::{PoseBuffer, PoseGate, PoseLookup};
 use crate::rigid::Rigid;
 use crate::source::Rig;
 use crate::source::bag::BagSource;
+use crate::source::mount::Mount;
 use crate::source::topics::PoseTopic;
 use crate::sync::{DropCounts, DropReason, FrameSet};
 use crate::tf::TfTree;
@@ -29,19 +30,41 @@ pub enum PoseStore {
         /// Vehicle frame.
         base: String,
     },
+    /// A topic of poses of the vehicle, beside a tree that has the cameras' joints or the frame the poses are given in.
+    Both {
+        /// The poses.
+        poses: PoseBuffer,
+        /// All transforms.
+        tree: TfTree,
+        /// Fixed frame, and the frame the poses are given in; `None` when they are one.
+        fixed_and_given: Option<(String, String)>,
+        /// Vehicle frame.
+        base: String,
+    },
 }
 
 impl PoseStore {
     /// Empty, for the pose topic a bag was planned with; a tree starts from the bag's static transforms.
     pub fn of_bag(source: &BagSource, rig: &Rig, config: &Config) -> Self {
         match source.plan().pose {
-            PoseTopic::Message(_) => Self::Buffer(PoseBuffer::new(&config.sync)),
-            PoseTopic::Tf => Self::Tree {
-                tree: source.statics(),
-                fixed: config.input.map_frame.clone(),
-                base: rig.base_frame.clone(),
-            },
+            PoseTopic::Message(_) => Self::of_messages(rig, config, || source.statics()),
+            PoseTopic::Tf => Self::of_tree(rig, source.statics()),
         }
+    }
+
+    /// Empty, for a pose topic; `statics` gives the tree where one is needed.
+    pub fn of_messages(rig: &Rig, config: &Config, statics: impl FnOnce() -> TfTree) -> Self {
+        let poses = PoseBuffer::new(&config.sync);
+        if !rig.needs_tree() {
+            return Self::Buffer(poses);
+        }
+        let fixed_and_given = rig.pose_frame.clone().map(|given| (rig.map_frame.clone(), given));
+        Self::Both { poses, tree: statics(), fixed_and_given, base: rig.base_frame.clone() }
+    }
+
+    /// The vehicle's pose comes from the tree itself.
+    pub fn of_tree(rig: &Rig, tree: TfTree) -> Self {
+        Self::Tree { tree, fixed: rig.map_frame.clone(), base: rig.base_frame.clone() }
     }
 
     /// Empty.
@@ -53,6 +76,42 @@ impl PoseStore {
         match self {
             Self::Buffer(poses) => poses.lookup(stamp_ns),
             Self::Tree { tree, fixed, base } => tree.lookup(fixed, base, stamp_ns).to_pose(),
+            Self::Both { poses, tree, fixed_and_given, .. } => match (poses.lookup(stamp_ns), fixed_and_given) {
+                (PoseLookup::At(given_from_base), Some((fixed, given))) => {
+                    match tree.lookup(fixed, given, stamp_ns).to_pose() {
+                        PoseLookup::At(fixed_from_given) => PoseLookup::At(fixed_from_given * given_from_base),
+                        other => other,
+                    }
+                }
+                (found, _) => found,
+            },
+        }
+    }
+
+    fn poses(&mut self) -> Option<&mut PoseBuffer> {
+        match self {
+            Self::Buffer(poses) | Self::Both { poses, .. } => Some(poses),
+            Self::Tree { .. } => None,
+        }
+    }
+
+    fn tree(&mut self) -> Option<&mut TfTree> {
+        match self {
+            Self::Tree { tree, .. } | Self::Both { tree, .. } => Some(tree),
+            Self::Buffer(_) => None,
+        }
+    }
+
+    /// A camera's mounting at a stamp.
+    fn mount(&self, mount: &Mount, stamp_ns: i64) -> PoseLookup {
+        match (&mount.joint, self) {
+            (Some(frame), Self::Tree { tree, base, .. } | Self::Both { tree, base, .. }) => {
+                match tree.lookup(base, frame, stamp_ns).to_pose() {
+                    PoseLookup::At(base_from_frame) => PoseLookup::At(base_from_frame * mount.frame_from_view),
+                    other => other,
+                }
+            }
+            _ => PoseLookup::At(mount.base_from_camera()),
         }
     }
 }
@@ -61,7 +120,7 @@ impl PoseStore {
 pub struct PoseStage<T> {
     store: PoseStore,
     gate: PoseGate<T>,
-    base_from_camera: Vec<Rigid>,
+    mounts: Vec<Mount>,
     epoch: u32,
     rejected: u64,
 }
@@ -69,13 +128,13 @@ pub struct PoseStage<T> {
 impl<T> PoseStage<T> {
     /// A stage for the cameras of `rig`.
     pub fn new(store: PoseStore, rig: &Rig, config: &SyncConfig) -> Self {
-        let base_from_camera = rig.cameras.iter().map(|c| c.base_from_camera).collect();
-        Self { store, gate: PoseGate::new(config), base_from_camera, epoch: 0, rejected: 0 }
+        let mounts = rig.cameras.iter().map(|c| c.mount.clone()).collect();
+        Self { store, gate: PoseGate::new(config), mounts, epoch: 0, rejected: 0 }
     }
 
     /// A pose of the vehicle; one that cannot be used is counted and said.
     pub fn push_pose(&mut self, stamp_ns: i64, map_from_base: Rigid) {
-        if let PoseStore::Buffer(poses) = &mut self.store
+        if let Some(poses) = self.store.poses()
             && let Err(e) = poses.push(stamp_ns, map_from_base)
         {
             self.reject(&format!("pose at {stamp_ns} ns refused: {e}"));
@@ -84,7 +143,7 @@ impl<T> PoseStage<T> {
 
     /// A transform of the tree; `is_static`: it holds at all times.
     pub fn push_transform(&mut self, transform: &TransformStamped, is_static: bool) {
-        if let PoseStore::Tree { tree, .. } = &mut self.store
+        if let Some(tree) = self.store.tree()
             && let Err(e) = tree.insert(transform, is_static)
         {
             self.reject(&format!("transform at {} ns refused: {e}", transform.header.stamp_ns));
@@ -107,9 +166,11 @@ impl<T> PoseStage<T> {
     pub fn push_set(&mut self, set: FrameSet<T>) {
         if set.epoch != self.epoch {
             self.epoch = set.epoch;
-            match &mut self.store {
-                PoseStore::Buffer(poses) => poses.follow_clock(set.stamp_ns),
-                PoseStore::Tree { tree, .. } => tree.follow_clock(set.stamp_ns),
+            if let Some(poses) = self.store.poses() {
+                poses.follow_clock(set.stamp_ns);
+            }
+            if let Some(tree) = self.store.tree() {
+                tree.follow_clock(set.stamp_ns);
             }
         }
         self.gate.push(set);
@@ -117,18 +178,23 @@ impl<T> PoseStage<T> {
 
     /// The next set with poses, if it is ready; `now_ns` is the newest stamp seen.
     pub fn pop(&mut self, now_ns: i64) -> Option<PosedSet<T>> {
-        let (store, mounts) = (&self.store, &self.base_from_camera);
+        let (store, mounts) = (&self.store, &self.mounts);
         self.gate.poll(now_ns, |camera, stamp_ns| match (store.lookup(stamp_ns), mounts.get(camera)) {
-            (PoseLookup::At(map_from_base), Some(mount)) => PoseLookup::At(map_from_base * *mount),
+            (PoseLookup::At(map_from_base), Some(mount)) => match store.mount(mount, stamp_ns) {
+                PoseLookup::At(base_from_camera) => PoseLookup::At(map_from_base * base_from_camera),
+                other => other,
+            },
             (other, _) => other,
         })
     }
 
     /// Forgets all poses (transforms that hold at all times stay) and drops the sets that wait.
     pub fn clear(&mut self) {
-        match &mut self.store {
-            PoseStore::Buffer(poses) => poses.clear(),
-            PoseStore::Tree { tree, .. } => tree.clear_moving(),
+        if let Some(poses) = self.store.poses() {
+            poses.clear();
+        }
+        if let Some(tree) = self.store.tree() {
+            tree.clear_moving();
         }
         self.gate.flush();
     }
@@ -138,17 +204,22 @@ impl<T> PoseStage<T> {
         self.gate.flush();
     }
 
-    /// The vehicle's pose a camera pose stands for.
-    pub fn base_pose(&self, camera: usize, map_from_camera: &Rigid) -> Rigid {
-        self.base_from_camera.get(camera).map_or(*map_from_camera, |m| *map_from_camera * m.inverse())
+    /// The vehicle's pose a camera pose at a stamp stands for.
+    pub fn base_pose(&self, camera: usize, stamp_ns: i64, map_from_camera: &Rigid) -> Rigid {
+        let Some(mount) = self.mounts.get(camera) else { return *map_from_camera };
+        let base_from_camera = match self.store.mount(mount, stamp_ns) {
+            PoseLookup::At(at) => at,
+            _ => mount.base_from_camera(),
+        };
+        *map_from_camera * base_from_camera.inverse()
     }
 
-    /// The same poses for other cameras: `base_from_camera` are their mountings. Sets that wait go, since they are not
-    /// of these cameras; they are counted as incomplete.
-    pub fn with_cameras(self, base_from_camera: Vec<Rigid>, config: &SyncConfig) -> Self {
+    /// The same poses for other cameras with these mountings. Sets that wait go, since they are not of these cameras; they
+    /// are counted as incomplete.
+    pub fn with_cameras(self, mounts: Vec<Mount>, config: &SyncConfig) -> Self {
         let mut drops = self.gate.drops().clone();
         drops.add(DropReason::Incomplete, self.gate.pending() as u64);
-        Self { gate: PoseGate::after(config, drops), base_from_camera, ..self }
+        Self { gate: PoseGate::after(config, drops), mounts, ..self }
     }
 
     /// Images that wait.
@@ -161,3 +232,7 @@ impl<T> PoseStage<T> {
         self.gate.drops()
     }
 }
+
+#[cfg(test)]
+#[path = "posed_tests.rs"]
+mod tests;

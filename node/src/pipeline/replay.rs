@@ -15,7 +15,6 @@ use tracing::{info, warn};
 use crate::config::Config;
 use crate::engine::{Engine, ModelSource, UNTRAINED};
 use crate::source::bag::BagSource;
-use crate::source::topics::PoseTopic;
 use crate::source::{Event, Rig};
 
 use super::front::{Front, FrontOutput};
@@ -87,17 +86,9 @@ pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
     Ok(metrics)
 }
 
-fn describe(source: &BagSource, rig: &Rig, engine: &Engine, (width, height): (usize, usize)) {
-    for (i, c) in rig.cameras.iter().enumerate() {
-        let (w, h) = c.rectifier.source_size();
-        let mark = if i == rig.reference { ", the anchor's" } else { "" };
-        info!("camera {i}: {} ({w}x{h} to {width}x{height}{mark})", c.topic);
-    }
-    let pose = match source.plan().pose {
-        PoseTopic::Message(t) => source.topic_name(t).to_string(),
-        PoseTopic::Tf => "/tf".into(),
-    };
-    info!("pose: {pose} of {}; network: {}", rig.base_frame, engine.model_config().describe());
+fn describe(source: &BagSource, rig: &Rig, engine: &Engine, size: (usize, usize)) {
+    rig.log(size);
+    info!("{}; network: {}", source.pose_line(), engine.model_config().describe());
 }
 
 struct Ran {
@@ -208,7 +199,8 @@ fn hand_on(
     for output in rest {
         let sent = match output {
             Some(FrontOutput::Set(set)) => {
-                let vehicle = set.frames.first().map(|f| (f.stamp_ns, front.base_pose(0, &f.map_from_camera)));
+                let vehicle =
+                    set.frames.first().map(|f| (f.stamp_ns, front.base_pose(0, f.stamp_ns, &f.map_from_camera)));
                 send(SinkInput::Set { set, vehicle })
             }
             Some(FrontOutput::Truth { camera, stamp_ns, kind, image }) => {

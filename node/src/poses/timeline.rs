@@ -110,6 +110,11 @@ impl Timeline {
         self.samples.back().map(|(s, _)| *s)
     }
 
+    /// The oldest sample kept.
+    pub fn first(&self) -> Option<Rigid> {
+        self.samples.front().map(|(_, transform)| *transform)
+    }
+
     /// Samples kept.
     pub fn len(&self) -> usize {
         self.samples.len()

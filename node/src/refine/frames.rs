@@ -109,6 +109,7 @@ pub fn shots(
     (most, hold_out): (usize, usize),
 ) -> Result<Vec<Shot>> {
     let source = BagSource::open(bag, config, size)?;
+    source.rig().log(size);
     let cameras = source.rig().intrinsics();
     let mut total = 0usize;
     run_front(&source, config, |output| {

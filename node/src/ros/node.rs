@@ -158,9 +158,14 @@ impl Running {
                 Use::Info(camera) => other |= describer.info(camera, &data),
                 Use::Pose => describer.pose(&data),
                 Use::Statics => describer.statics(&data),
-                Use::Tf => {}
+                Use::Tf | Use::Joints => describer.transforms(&data),
             }
-            if !matches!(stream.purpose, Use::Info(_)) {
+            let is_unused = match stream.purpose {
+                Use::Info(_) => true,
+                Use::Joints => !describer.needs_joints(),
+                _ => false,
+            };
+            if !is_unused {
                 messages.push(input, Message { input, data, received_ns });
             }
             sent.push(input);

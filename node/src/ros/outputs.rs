@@ -136,7 +136,7 @@ impl Outputs {
     }
 
     fn transforms(&mut self, step: &Step, maker: &StepMaker) -> Result<()> {
-        let frame = &self.config.input.map_frame;
+        let frame = &self.rig.map_frame;
         let origin = maker.map().origin();
         if self.origin != Some(origin) {
             let still = messages::origin_transform(frame, step.window.stamp_ns, origin);
@@ -187,7 +187,7 @@ impl Outputs {
             self.counts.withheld += built.non_finite as u64;
             self.tracks.send(encode::encode_point_cloud2(&built.cloud))?;
         }
-        let header = Header { stamp_ns, frame_id: self.config.input.map_frame.clone() };
+        let header = Header { stamp_ns, frame_id: self.rig.map_frame.clone() };
         if self.objects.wanted() {
             self.objects.send(encode_live::encode_markers(&convert::markers(maker.objects(), &header)))?;
         }
@@ -201,7 +201,7 @@ impl Outputs {
     fn path(&mut self) -> Result<()> {
         let due = self.path_sent.is_none_or(|at| at.elapsed().as_secs_f64() >= PATH_EVERY_SEC);
         if due && self.path.wanted() {
-            let path = messages::path(&self.config.input.map_frame, self.poses.make_contiguous());
+            let path = messages::path(&self.rig.map_frame, self.poses.make_contiguous());
             self.path.send(encode::encode_path(&path))?;
             self.path_sent = Some(Instant::now());
         }

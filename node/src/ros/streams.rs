@@ -26,8 +26,10 @@ pub enum Use {
     Info(usize),
     /// Vehicle poses.
     Pose,
-    /// Moving transforms.
+    /// Moving transforms, which have the vehicle's pose.
     Tf,
+    /// Moving transforms beside a pose topic: joints, and frames above the poses' own.
+    Joints,
     /// Transforms that hold at all times.
     Statics,
 }
@@ -73,9 +75,15 @@ pub fn streams(plan: &LivePlan, config: &LiveConfig) -> Vec<Stream> {
             let role = Role::Pose { type_name: type_name.clone() };
             add(topic, Use::Pose, role, type_name, qos::poses(config));
         }
-        LivePose::Tf => add("/tf", Use::Tf, Role::Transform, tf, qos::poses(config)),
+        LivePose::Tf => plan.tf.iter().for_each(|t| add(t, Use::Tf, Role::Transform, tf, qos::poses(config))),
     }
-    add("/tf_static", Use::Statics, Role::StaticTransform, tf, qos::statics());
+    for topic in &plan.tf_static {
+        add(topic, Use::Statics, Role::StaticTransform, tf, qos::statics());
+    }
+    if plan.pose != LivePose::Tf {
+        // Joints that carry cameras, and what leads from the poses' frame to the configured one.
+        plan.tf.iter().for_each(|t| add(t, Use::Joints, Role::Transform, tf, qos::poses(config)));
+    }
     for (camera, c) in plan.cameras.iter().enumerate() {
         add(&c.info, Use::Info(camera), Role::None, "sensor_msgs/msg/CameraInfo", qos::infos());
     }

@@ -45,6 +45,10 @@ pub struct LivePlan {
     pub pose: LivePose,
     /// Image topics that are no cameras.
     pub left_out: Vec<LeftOut>,
+    /// Topics of the transform tree: those that change, those that hold at all times.
+    pub tf: Vec<String>,
+    /// See `tf`.
+    pub tf_static: Vec<String>,
 }
 
 impl LivePlan {
@@ -66,7 +70,8 @@ impl LivePlan {
                 ("raw", COMPRESSED) => !t.name.strip_suffix("/compressed").is_some_and(|raw| has(raw, IMAGE)),
                 _ => true,
             })
-            .cloned()
+            // A recording counts messages; how many publishers there are says nothing of that kind.
+            .map(|t| Topic { count: 1, ..t.clone() })
             .collect();
         let there = |name: &str| graph.iter().any(|t| t.name == name);
         let mut input = config.input.clone();
@@ -114,7 +119,13 @@ impl LivePlan {
                 type_name: graph.get(t).map(|t| t.type_name.clone()).unwrap_or_default(),
             },
         };
-        Ok((Self { cameras, pose, left_out: plan.left_out }, named || config.live.cameras != 0))
+        let tf = plan.tf.iter().map(|&t| name(t)).collect();
+        let mut tf_static: Vec<String> = plan.tf_static.iter().map(|&t| name(t)).collect();
+        if tf_static.is_empty() {
+            // Nobody publishes it yet: it is listened to all the same.
+            tf_static.push("/tf_static".into());
+        }
+        Ok((Self { cameras, pose, left_out: plan.left_out, tf, tf_static }, named || config.live.cameras != 0))
     }
 }
 
@@ -152,6 +163,25 @@ mod tests {
         assert_eq!((plan.cameras[0].image.as_str(), settled), ("/front/image_rect/compressed", true));
         let e = resolve(&graph(), "", &["live.cameras=2"]).unwrap_err();
         assert!(e.contains("live.cameras = 2") && e.contains("/front/image_rect"), "{e}");
+    }
+
+    #[test]
+    fn one_of_two_robots_trees_is_named() {
+        let mut graph = graph();
+        graph.retain(|t| t.name != "/odom");
+        graph.push(topic("/robot1/tf", "tf2_msgs/msg/TFMessage"));
+        graph.push(Topic { count: 3, ..topic("/robot2/tf", "tf2_msgs/msg/TFMessage") });
+        let e = resolve(&graph, "", &[]).unwrap_err();
+        assert!(e.contains("/robot1/tf") && e.contains("/robot2/tf") && e.contains("input.pose"), "{e}");
+        let (plan, _) = resolve(&graph, "", &["input.pose=/robot2/tf"]).unwrap();
+        assert_eq!((plan.pose, plan.tf), (LivePose::Tf, vec!["/robot2/tf".to_owned()]));
+        assert_eq!(plan.tf_static, ["/tf_static"]);
+        // Three publishers beside one make no one-shot of the one.
+        graph.push(topic("/odom", "nav_msgs/msg/Odometry"));
+        assert!(matches!(
+            resolve(&graph, "", &["input.base_from_camera=[[0,0,0,1,0,0,0]]"]).unwrap().0.pose,
+            LivePose::Message { .. }
+        ));
     }
 
     #[test]

@@ -9,13 +9,16 @@ use tracing::{info, warn};
 use crate::bag::Bag;
 use crate::cdr::decode as cdr;
 use crate::config::{Config, InputConfig, SyncConfig};
-use crate::msg::{CameraInfo, TransformStamped};
+use crate::msg::{CameraInfo, PoseStamped, TransformStamped};
 use crate::sync::DropReason;
+use crate::sync::clock::seconds_between;
 use crate::tf::TfTree;
 
 use super::event::Event;
 use super::first::FirstPictures;
 use super::first_images::black_frames;
+use super::frames::{Frames, MAP_FRAME_AHEAD_SEC};
+use super::mount::PoseNames;
 use super::rig::{CameraDescription, Rig};
 use super::topics::{COMPRESSED, PoseTopic, TopicError, TopicPlan};
 use super::translate::{Role, translate};
@@ -41,24 +44,20 @@ impl BagSource {
         if bag.message_count() == 0 {
             anyhow::bail!("bag {} holds no messages", path.display());
         }
-        let plan = plan_of(&bag, &config.input).with_context(|| format!("bag {}", path.display()))?;
+        let place = || format!("bag {}", path.display());
+        let plan = plan_of(&bag, &config.input).with_context(place)?;
         for left_out in &plan.left_out {
             info!("no camera: {left_out}");
         }
-        let (mut described, pose_child, static_transforms) =
-            describe(&bag, &plan).with_context(|| format!("bag {}", path.display()))?;
+        let Described { mut cameras, pose, statics: static_transforms } = describe(&bag, &plan).with_context(place)?;
         if config.input.find_black_frame {
-            let frames = black_frames(&bag, &plan).with_context(|| format!("bag {}", path.display()))?;
-            described.iter_mut().zip(frames).for_each(|(camera, frame)| camera.black_frame = frame);
+            let frames = black_frames(&bag, &plan).with_context(place)?;
+            cameras.iter_mut().zip(frames).for_each(|(camera, frame)| camera.black_frame = frame);
         }
-        let rig = Rig::build(
-            described,
-            &static_tree(&config.sync, &static_transforms),
-            &pose_child,
-            &config.input,
-            network_size,
-        )
-        .with_context(|| format!("bag {}", path.display()))?;
+        let mut tree = static_tree(&config.sync, &static_transforms);
+        let frames = Frames::new(&config.input, plan.pose == PoseTopic::Tf, &cameras, pose);
+        let pose = read_moving(&bag, &plan, &frames, &mut tree).with_context(place)?;
+        let rig = Rig::build(cameras, &tree, &pose, &config.input, network_size).with_context(place)?;
         let mut roles = vec![Role::None; bag.topics().len()];
         for (camera, c) in plan.cameras.iter().enumerate() {
             roles[c.image] = Role::Image { camera, compressed: c.compressed };
@@ -71,7 +70,10 @@ impl BagSource {
             PoseTopic::Message(topic) => {
                 roles[topic] = Role::Pose { type_name: bag.topics()[topic].type_name.clone() };
             }
-            PoseTopic::Tf => plan.tf.iter().for_each(|&t| roles[t] = Role::Transform),
+            PoseTopic::Tf => {}
+        }
+        if plan.pose == PoseTopic::Tf || rig.needs_tree() {
+            plan.tf.iter().for_each(|&t| roles[t] = Role::Transform);
         }
         Ok(Self { bag, plan, rig: Arc::new(rig), sync: config.sync.clone(), static_transforms, roles })
     }
@@ -89,6 +91,19 @@ impl BagSource {
     /// The static transforms, for a pose that comes from TF.
     pub fn statics(&self) -> TfTree {
         static_tree(&self.sync, &self.static_transforms)
+    }
+
+    /// Where the pose comes from and between which frames, for people.
+    pub fn pose_line(&self) -> String {
+        let topics = match self.plan.pose {
+            PoseTopic::Message(t) => self.topic_name(t).to_string(),
+            PoseTopic::Tf => self.plan.tf.iter().map(|&t| self.topic_name(t)).collect::<Vec<_>>().join(", "),
+        };
+        let (base, map) = (&self.rig.base_frame, &self.rig.map_frame);
+        match &self.rig.pose_frame {
+            Some(given) => format!("pose: {topics}, `{base}` in `{given}`, brought into `{map}` by /tf"),
+            None => format!("pose: {topics}, `{base}` in `{map}`"),
+        }
     }
 
     /// Name of topic number `topic` of the plan.
@@ -167,15 +182,22 @@ pub fn static_tree(sync: &SyncConfig, transforms: &[TransformStamped]) -> TfTree
     tree
 }
 
+/// What was read ahead.
+struct Described {
+    cameras: Vec<CameraDescription>,
+    pose: PoseNames,
+    statics: Vec<TransformStamped>,
+}
+
 /// Reads ahead until every camera is described: CameraInfo, first image's frame, a picture that can be decoded, /tf_static,
-/// the pose's child frame.
-fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, String, Vec<TransformStamped>)> {
+/// the pose's frames.
+fn describe(bag: &Bag, plan: &TopicPlan) -> Result<Described> {
     let mut statics = Vec::new();
     let n = plan.cameras.len();
     let mut infos: Vec<Option<CameraInfo>> = vec![None; n];
     let mut frames: Vec<Option<String>> = vec![None; n];
     let mut pictures = FirstPictures::new(n);
-    let mut pose_child: Option<String> = None;
+    let mut pose: Option<PoseNames> = None;
     let pose_topic = match plan.pose {
         PoseTopic::Message(t) => Some(t),
         PoseTopic::Tf => None,
@@ -195,8 +217,9 @@ fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, Stri
                 Err(e) => warn!("/tf_static: {e}"),
             }
         }
-        if pose_topic == Some(m.topic) && pose_child.is_none() {
-            pose_child = cdr::pose(&bag.topics()[m.topic].type_name, &m.data).ok().map(|p| p.child_frame_id);
+        if pose_topic == Some(m.topic) && pose.is_none() {
+            let names = |p: PoseStamped| PoseNames { frame: p.header.frame_id, child: p.child_frame_id };
+            pose = cdr::pose(&bag.topics()[m.topic].type_name, &m.data).ok().map(names);
         }
         for (i, c) in plan.cameras.iter().enumerate() {
             if c.info == m.topic && infos[i].is_none() {
@@ -213,12 +236,12 @@ fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, Stri
             }
         }
         let described = infos.iter().all(Option::is_some) && frames.iter().all(Option::is_some) && pictures.done();
-        if described && statics_left == 0 && (pose_topic.is_none() || pose_child.is_some()) {
+        if described && statics_left == 0 && (pose_topic.is_none() || pose.is_some()) {
             break;
         }
     }
     pictures.finish(&plan.cameras)?;
-    let described = plan
+    let cameras = plan
         .cameras
         .iter()
         .zip(infos)
@@ -231,5 +254,26 @@ fn describe(bag: &Bag, plan: &TopicPlan) -> Result<(Vec<CameraDescription>, Stri
             black_frame: None,
         })
         .collect();
-    Ok((described, pose_child.unwrap_or_default(), statics))
+    Ok(Described { cameras, pose: pose.unwrap_or_default(), statics })
+}
+
+/// Reads /tf ahead into `tree`, as far as the frames need it: to where the pose comes from (with a tree), to the cameras that
+/// no fixed transform leads to, to the configured map frame. Gives the frames of the pose.
+fn read_moving(bag: &Bag, plan: &TopicPlan, frames: &Frames, tree: &mut TfTree) -> Result<PoseNames> {
+    let mut first_ns: Option<i64> = None;
+    if !frames.complete(tree, false) && !plan.tf.is_empty() {
+        for message in bag.messages(&plan.tf)? {
+            let Ok(m) = message else { continue };
+            // What cannot be read or used is said when the events are read.
+            let Ok(list) = cdr::tf_message(&m.data) else { continue };
+            for t in &list {
+                let _ = tree.insert(t, false);
+            }
+            let ahead_sec = seconds_between(*first_ns.get_or_insert(m.log_time_ns), m.log_time_ns);
+            if frames.complete(tree, ahead_sec > MAP_FRAME_AHEAD_SEC) {
+                break;
+            }
+        }
+    }
+    frames.pose(tree).map_err(anyhow::Error::msg)
 }

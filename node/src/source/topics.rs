@@ -1,5 +1,7 @@
 //! Which topics of a recording play which part: by configuration, or found by type.
 
+mod pose;
+
 use serde::Serialize;
 use thiserror::Error;
 
@@ -158,12 +160,8 @@ impl TopicPlan {
             };
             cameras.push(CameraTopics { image, compressed: topics[image].type_name == COMPRESSED, name, info });
         }
-        let of_tf = |is_static: bool| {
-            let fits = |t: &Topic| t.type_name == TF && t.name.ends_with("tf_static") == is_static;
-            (0..topics.len()).filter(|&i| fits(&topics[i])).collect::<Vec<_>>()
-        };
-        let (tf, tf_static) = (of_tf(false), of_tf(true));
-        let pose = find_pose(topics, config, !tf.is_empty())?;
+        let pose = pose::find_pose(topics, config)?;
+        let pose::Tree { moving: tf, fixed: tf_static } = pose::Tree::choose(topics, config, &pose, &cameras)?;
         let truth = find_truth(topics, config, &cameras);
         Ok(Self { cameras, pose, tf, tf_static, truth, left_out })
     }
@@ -213,27 +211,6 @@ fn find_info(topics: &[Topic], image: &str) -> Result<usize, TopicError> {
         key: "input.camera_infos",
         candidates: list(infos.iter().map(|&i| &topics[i])),
     })
-}
-
-fn find_pose(topics: &[Topic], config: &InputConfig, has_tf: bool) -> Result<PoseTopic, TopicError> {
-    if !config.pose.is_empty() {
-        let mut types = POSE_TYPES.to_vec();
-        types.push(TF);
-        let i = named(topics, "input.pose", &config.pose, &types)?;
-        return Ok(if topics[i].type_name == TF { PoseTopic::Tf } else { PoseTopic::Message(i) });
-    }
-    let fits = |t: &Topic| POSE_TYPES.contains(&t.type_name.as_str()) && t.count > 0 && !is_truth(t, config);
-    let found: Vec<usize> = (0..topics.len()).filter(|&i| fits(&topics[i])).collect();
-    match found.as_slice() {
-        [one] => Ok(PoseTopic::Message(*one)),
-        [] if has_tf => Ok(PoseTopic::Tf),
-        [] => Err(TopicError::None { part: "vehicle pose topic", found: list(topics.iter()) }),
-        many => Err(TopicError::Ambiguous {
-            part: "the vehicle pose".into(),
-            key: "input.pose",
-            candidates: list(many.iter().map(|&i| &topics[i])),
-        }),
-    }
 }
 
 /// Ground truth of camera i is below `<prefix>/<the camera's own namespace>/{depth,flow,moving,sky,instance}`;

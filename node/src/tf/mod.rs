@@ -49,6 +49,15 @@ impl TfLookup {
     }
 }
 
+/// How two frames of a tree are connected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Link {
+    /// By transforms that hold at all times.
+    Static,
+    /// By at least one that changes.
+    Moving,
+}
+
 #[derive(Debug)]
 enum Motion {
     Static(Rigid),
@@ -144,6 +153,39 @@ impl TfTree {
             (never @ TfLookup::Never(_), _) | (_, never @ TfLookup::Never(_)) => never,
             (wait @ TfLookup::Wait(_), _) | (_, wait) => wait,
         }
+    }
+
+    /// Whether and how two frames are connected, and `target_from_source` with every moving transform at its first sample;
+    /// `None` when they are not, or a moving transform has no sample.
+    pub fn link(&self, target: &str, source: &str) -> Option<(Link, Rigid)> {
+        let index = |name: &str| self.by_name.get(bare(name)).copied();
+        let (target, source) = (index(target)?, index(source)?);
+        let (above_target, above_source) = (self.ancestors(target), self.ancestors(source));
+        let common = above_target.iter().copied().find(|f| above_source.contains(f))?;
+        let mut link = Link::Static;
+        let mut up = |from: usize| {
+            let (mut at, mut at_from_frame) = (from, Rigid::IDENTITY);
+            while at != common {
+                let Edge { parent, motion } = self.frames[at].edge.as_ref()?;
+                let parent_from_at = match motion {
+                    Motion::Static(t) => *t,
+                    Motion::Moving(timeline) => {
+                        link = Link::Moving;
+                        timeline.first()?
+                    }
+                };
+                (at, at_from_frame) = (*parent, parent_from_at * at_from_frame);
+            }
+            Some(at_from_frame)
+        };
+        let (common_from_target, common_from_source) = (up(target)?, up(source)?);
+        Some((link, relative(&common_from_target, &common_from_source)))
+    }
+
+    /// The topmost frame above `frame`; `None` when nothing was heard of it.
+    pub fn root(&self, frame: &str) -> Option<&str> {
+        let index = self.by_name.get(bare(frame)).copied()?;
+        self.ancestors(index).last().map(|&top| self.frames[top].name.as_str())
     }
 
     /// True when both names were heard of.

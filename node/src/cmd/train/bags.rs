@@ -87,6 +87,7 @@ impl BagClips {
         let name = path.file_name().map_or_else(|| "bag".into(), |n| n.to_string_lossy().into_owned());
         let source = BagSource::open(path, config, size)?;
         let rig = source.rig();
+        rig.log(size);
         let cameras = match options.cameras {
             Some(n) if n > rig.cameras.len() => {
                 let text = format!("--bag-cameras {n}: bag {name} has {} camera(s)", rig.cameras.len());

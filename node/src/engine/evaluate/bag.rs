@@ -68,6 +68,7 @@ impl BagClips {
         config.model.sweep_prior_sec = prior_sec;
         let config = &config;
         let source = BagSource::open(path, config, size)?;
+        source.rig().log(size);
         let (mut sets, mut windows) = (Vec::new(), Vec::new());
         run_front(&source, config, |output| {
             match output {

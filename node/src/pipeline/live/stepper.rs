@@ -114,7 +114,7 @@ impl Stepper {
             if let FrontOutput::Set(set) = output {
                 self.own.sets += 1;
                 if let Some(first) = set.frames.first() {
-                    let map_from_base = self.front.base_pose(0, &first.map_from_camera);
+                    let map_from_base = self.front.base_pose(0, first.stamp_ns, &first.map_from_camera);
                     self.output("vehicle pose", |s| {
                         s.outlet.vehicle(first.stamp_ns, map_from_base);
                         Ok(())

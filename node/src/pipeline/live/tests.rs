@@ -14,6 +14,7 @@ use crate::pipeline::step::{OnPart, Part, Step, StepMaker};
 use crate::poses::PoseBuffer;
 use crate::rigid::Rigid;
 use crate::source::Rig;
+use crate::source::mount::PoseNames;
 use crate::source::rig::CameraDescription;
 use crate::source::translate::Role;
 use crate::sync::DropReason;
@@ -121,7 +122,7 @@ pub(crate) fn rig(cameras: usize) -> Arc<Rig> {
         })
         .collect();
     let tree = TfTree::new(&config.sync);
-    Arc::new(Rig::build(described, &tree, "", &config.input, (WIDTH, HEIGHT)).unwrap())
+    Arc::new(Rig::build(described, &tree, &PoseNames::default(), &config.input, (WIDTH, HEIGHT)).unwrap())
 }
 
 fn start(cameras: usize, config: &Config, delay: Duration, demand: Demand) -> anyhow::Result<Running> {

@@ -4,6 +4,7 @@
 
 mod gallery;
 mod topics;
+mod trajectory;
 
 pub use topics::{PREFIX, Publisher};
 
@@ -22,7 +23,6 @@ use crate::output::OutputError;
 use crate::output::objects_csv::ObjectsWriter;
 use crate::output::ply::{PlyCloud, write_ply};
 use crate::output::tracks_csv::{TrackRow, TracksWriter};
-use crate::output::tum::write_tum;
 use crate::rigid::Rigid;
 use crate::source::rig::RigCamera;
 use crate::source::topics::TruthKind;
@@ -38,6 +38,7 @@ use super::step::{Finished, Step};
 use super::timing::{Timings, peak_rss_mb};
 use crate::output::atomic::write_bytes;
 use gallery::{Gallery, Run};
+use trajectory::Trajectory;
 
 /// Most trajectory rows kept for the report's picture: some 2,000 trajectories of two seconds.
 const ROWS_DRAWN: usize = 40_000;
@@ -81,7 +82,7 @@ pub struct Sink {
     publisher: Option<Publisher>,
     scorer: Option<Scorer>,
     gallery: Gallery,
-    poses: Vec<(i64, Rigid)>,
+    trajectory: Trajectory,
     sets: u64,
     last_gaussians: u64,
     epochs: u32,
@@ -117,7 +118,7 @@ impl Sink {
             publisher,
             scorer,
             gallery: Gallery::new(config.output.report_steps),
-            poses: Vec::new(),
+            trajectory: Trajectory::default(),
             sets: 0,
             last_gaussians: 0,
             epochs: 0,
@@ -136,7 +137,9 @@ impl Sink {
             SinkInput::Set { set, vehicle } => {
                 self.sets += 1;
                 self.epochs = self.epochs.max(set.epoch);
-                self.poses.extend(vehicle);
+                if let Some((stamp_ns, map_from_base)) = vehicle {
+                    self.trajectory.push(set.epoch, stamp_ns, map_from_base);
+                }
                 if let Some(scorer) = &mut self.scorer {
                     scorer.set(set);
                 }
@@ -148,8 +151,8 @@ impl Sink {
             }
             SinkInput::Map(update) => {
                 if let Some(publisher) = &mut self.publisher {
-                    let config = &self.config;
-                    if let Err(e) = self.timings.time("publish map", || publisher.map_update(&update, config)) {
+                    let rig = &self.rig;
+                    if let Err(e) = self.timings.time("publish map", || publisher.map_update(&update, rig)) {
                         self.gave_up_bag("outputs.mcap at a map update", &e);
                     }
                 }
@@ -224,7 +227,8 @@ impl Sink {
     ) -> Result<Metrics> {
         self.write_tracks(&finished.tracks);
         self.write_objects(&finished.objects);
-        let Self { out, config, publisher, scorer, gallery, poses, tracks, objects, drawn: rows, .. } = self;
+        let Self { out, rig, config, publisher, scorer, gallery, trajectory, tracks, objects, drawn: rows, .. } = self;
+        let poses = trajectory.all();
         let (mut problems, mut published) = (self.problems, self.published);
         let mut written = |what: &str, done: Result<()>| {
             if let Err(e) = done {
@@ -245,15 +249,19 @@ impl Sink {
         };
         let notes = [
             format!("storm {}; weights: {weights}; model: {model}", env!("CARGO_PKG_VERSION")),
-            "static map without the sky; positions in metres, relative to origin_m in the map frame".to_string(),
+            format!(
+                "static map without the sky; positions in metres, relative to origin_m in the frame {}",
+                rig.map_frame
+            ),
         ];
         written("map.ply", write_ply(&place("map.ply"), &cloud, origin.to_array(), &notes).map_err(Into::into));
-        written("trajectory.tum", write_tum(&place("trajectory.tum"), poses.iter().copied()).map_err(Into::into));
+        let tum = trajectory.write(&out, &rig.map_frame, &rig.base_frame);
+        written("trajectory.tum", tum.map_err(Into::into));
         let yaml = config.to_yaml();
         written("config.yaml", write_bytes(&place("config.yaml"), yaml.as_bytes()).map_err(Into::into));
         if let Some(publisher) = publisher {
             published = publisher.counts();
-            let done = publisher.finish(&cloud, origin, &poses, &config);
+            let done = publisher.finish(&cloud, origin, &trajectory, &rig);
             written("the end of outputs.mcap", done.map(|counts| published = counts));
         }
         let mut timings = finished.timings;
@@ -261,10 +269,6 @@ impl Sink {
         let held_out = match scorer {
             Some(scorer) => scorer.finish()?,
             None => None,
-        };
-        let recorded_ns = match (poses.first(), poses.last()) {
-            (Some(first), Some(last)) => last.0.saturating_sub(first.0),
-            _ => 0,
         };
         problems.extend(counts.problems);
         let mut metrics = Metrics {
@@ -287,7 +291,7 @@ impl Sink {
             latency_ms: timings.stats(),
             peak_rss_mb: peak_rss_mb(),
             wall_sec: wall.as_secs_f64(),
-            recorded_sec: recorded_ns as f64 * 1e-9,
+            recorded_sec: trajectory.recorded_ns() as f64 * 1e-9,
             gaussians: self.last_gaussians,
             gaussians_left_out: published.truncated,
             map_gaussians: finished.map.len() as u64,
@@ -300,6 +304,8 @@ impl Sink {
             objects: finished.object_counts,
             overlap: finished.overlap,
             batch: finished.batch,
+            map_frame: rig.map_frame.clone(),
+            base_frame: rig.base_frame.clone(),
             origin_m: origin.to_array(),
             epochs: self.epochs,
             held_out,
@@ -311,7 +317,7 @@ impl Sink {
         }
         let title = self.title;
         let run = Run { title: &title, metrics: &metrics, map: &map, tracks: &rows, poses: &poses, config: &config };
-        if let Err(e) = gallery.write(&place("report.html"), &self.rig, &run) {
+        if let Err(e) = gallery.write(&place("report.html"), &rig, &run) {
             late.push(format!("report.html could not be written: {e:#}"));
         }
         metrics.problems.extend(late);

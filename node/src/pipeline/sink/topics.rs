@@ -15,8 +15,9 @@ use crate::output::qos::Qos;
 use crate::pipeline::map_updates::MapUpdate;
 use crate::pipeline::messages::{self, Pictures, Published};
 use crate::pipeline::step::Step;
-use crate::rigid::Rigid;
 use crate::source::Rig;
+
+use super::trajectory::Trajectory;
 
 /// Prefix of all topics: what `~/` resolves to for a node called storm.
 pub const PREFIX: &str = "/storm/output";
@@ -86,7 +87,7 @@ impl Publisher {
     /// Writes one step.
     pub fn step(&mut self, step: &Step, rig: &Rig, config: &Config) -> Result<()> {
         let stamp_ns = step.window.stamp_ns;
-        let tf = messages::anchor_transform(step, &config.input.map_frame);
+        let tf = messages::anchor_transform(step, &rig.map_frame);
         self.bag.write(self.tf, stamp_ns, &encode::encode_tf_message(&[tf])?)?;
         let cloud = messages::gaussians(step, config, &mut self.counts)?;
         self.bag.write(self.gaussians, stamp_ns, &encode::encode_point_cloud2(&cloud)?)?;
@@ -109,17 +110,17 @@ impl Publisher {
     }
 
     /// Writes changed tiles of the map.
-    pub fn map_update(&mut self, update: &MapUpdate, config: &Config) -> Result<()> {
-        self.tell_origin(update.stamp_ns, update.origin, config)?;
+    pub fn map_update(&mut self, update: &MapUpdate, rig: &Rig) -> Result<()> {
+        self.tell_origin(update.stamp_ns, update.origin, rig)?;
         let cloud = messages::map_update(update.stamp_ns, update.tile_m, &update.tiles, &mut self.counts)?;
         self.bag.write(self.map_update, update.stamp_ns, &encode::encode_point_cloud2(&cloud)?)?;
         Ok(())
     }
 
     /// Says where the map's frame is, once.
-    fn tell_origin(&mut self, stamp_ns: i64, origin: DVec3, config: &Config) -> Result<()> {
+    fn tell_origin(&mut self, stamp_ns: i64, origin: DVec3, rig: &Rig) -> Result<()> {
         if self.origin_told != Some(origin) {
-            let still = messages::origin_transform(&config.input.map_frame, stamp_ns, origin);
+            let still = messages::origin_transform(&rig.map_frame, stamp_ns, origin);
             self.bag.write(self.tf_static, stamp_ns, &encode::encode_tf_message(&[still])?)?;
             self.origin_told = Some(origin);
         }
@@ -131,16 +132,10 @@ impl Publisher {
         self.counts
     }
 
-    /// Writes the map, its frame, and the trajectory, then the bag's index.
-    pub fn finish(
-        mut self,
-        map: &PlyCloud,
-        origin: DVec3,
-        poses: &[(i64, Rigid)],
-        config: &Config,
-    ) -> Result<Published> {
-        let stamp_ns = poses.last().map_or(0, |(stamp, _)| *stamp);
-        self.tell_origin(stamp_ns, origin, config)?;
+    /// Writes the map, its frame, and the trajectory (one message for each stretch of rising time), then the bag's index.
+    pub fn finish(mut self, map: &PlyCloud, origin: DVec3, trajectory: &Trajectory, rig: &Rig) -> Result<Published> {
+        let stamp_ns = trajectory.last_ns().unwrap_or(0);
+        self.tell_origin(stamp_ns, origin, rig)?;
         let cloud = MapCloud {
             positions: &map.positions,
             colors01: &map.colors01,
@@ -150,8 +145,10 @@ impl Publisher {
         };
         let cloud = messages::map(stamp_ns, &cloud, &mut self.counts)?;
         self.bag.write(self.map, stamp_ns, &encode::encode_point_cloud2(&cloud)?)?;
-        let path = messages::path(&config.input.map_frame, poses);
-        self.bag.write(self.path, stamp_ns, &encode::encode_path(&path)?)?;
+        for (_, poses) in trajectory.epochs() {
+            let path = messages::path(&rig.map_frame, poses);
+            self.bag.write(self.path, path.header.stamp_ns, &encode::encode_path(&path)?)?;
+        }
         self.bag.finish()?;
         Ok(self.counts)
     }

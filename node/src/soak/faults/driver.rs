@@ -18,6 +18,7 @@ use crate::pipeline::posed::PoseStore;
 use crate::pipeline::timing::rss_mb;
 use crate::rigid::Rigid;
 use crate::source::Rig;
+use crate::source::mount::PoseNames;
 use crate::source::rig::CameraDescription;
 use crate::source::translate::Role;
 use crate::sync::DropReason;
@@ -188,7 +189,8 @@ impl<'a> Car<'a> {
             )),
             black_frame: None,
         });
-        let rig = Rig::build(described.collect(), &TfTree::new(&config.sync), "", &config.input, size)?;
+        let rig =
+            Rig::build(described.collect(), &TfTree::new(&config.sync), &PoseNames::default(), &config.input, size)?;
         let rig = Arc::new(rig);
         let engine = Engine::new(source, &config.model, cameras, config.window.timespan_sec)?.with_skips(&config.skip);
         let image =

@@ -102,7 +102,7 @@ impl Outlet for Sink {
         let mut counts = Published::default();
         let mut bytes = 0;
         let mut sent = |message: Vec<u8>| bytes += message.len() as u64;
-        sent(encode::encode_tf_message(&[messages::anchor_transform(step, &self.config.input.map_frame)])?);
+        sent(encode::encode_tf_message(&[messages::anchor_transform(step, &self.rig.map_frame)])?);
         sent(encode::encode_point_cloud2(&messages::gaussians(step, &self.config, &mut counts)?)?);
         sent(encode::encode_point_cloud2(&messages::flow(step, &mut counts)?)?);
         for (view, &camera) in active.iter().enumerate() {

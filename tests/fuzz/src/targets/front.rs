@@ -23,8 +23,14 @@ pub fn front(data: &[u8]) {
     let rig = rig();
     let config = Config::default();
     let options = b.u8();
-    let store = match options & 1 {
+    let store = match options & 5 {
         0 => PoseStore::Buffer(PoseBuffer::new(&config.sync)),
+        4 => PoseStore::Both {
+            poses: PoseBuffer::new(&config.sync),
+            tree: TfTree::new(&config.sync),
+            fixed_and_given: Some(("map".into(), "odom".into())),
+            base: "base".into(),
+        },
         _ => PoseStore::Tree { tree: TfTree::new(&config.sync), fixed: "map".into(), base: "base".into() },
     };
     let on_demand = options & 2 == 2;

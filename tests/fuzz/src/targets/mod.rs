@@ -25,6 +25,7 @@ use storm_node::output::ply::read_ply;
 use storm_node::pipeline::front::Front;
 use storm_node::pipeline::posed::PoseStore;
 use storm_node::source::bag::BagSource;
+use storm_node::source::mount::PoseNames;
 use storm_node::source::rig::CameraDescription;
 use storm_node::source::translate::{Role, translate};
 use storm_node::source::{Event, Rig};
@@ -178,7 +179,9 @@ fn rig() -> Arc<Rig> {
         let mut config = Config::default();
         config.input.base_from_camera = vec![[0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5]; 2];
         let tree = TfTree::new(&config.sync);
-        Arc::new(Rig::build(described.collect(), &tree, "", &config.input, NETWORK).expect("a sound rig"))
+        Arc::new(
+            Rig::build(described.collect(), &tree, &PoseNames::default(), &config.input, NETWORK).expect("a sound rig"),
+        )
     })
     .clone()
 }
