@@ -4,8 +4,10 @@
 //! result is the control's, [`run::Ran::refused`] that it was refused in one sentence.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used)]
 
+mod calibration;
 mod encodings;
 mod formats;
+mod frames;
 mod not_color;
 mod recording;
 mod run;

@@ -68,6 +68,12 @@ impl Recording {
         DRIVE.get_or_init(|| drive(1)).clone()
     }
 
+    /// The same drive with a stereo pair.
+    pub fn pair() -> Self {
+        static DRIVE: OnceLock<Recording> = OnceLock::new();
+        DRIVE.get_or_init(|| drive(2)).clone()
+    }
+
     /// Every message of `topic` becomes what `with` makes of it: none, one, or several.
     pub fn each(self, topic: &str, mut with: impl FnMut(Message) -> Vec<Message>) -> Self {
         let change = |m: Message| if m.topic == topic { with(m) } else { vec![m] };

@@ -280,7 +280,7 @@ impl Sink {
             steps_skipped: finished.skips.skipped(),
             skips: finished.skips,
             dropped: counts.dropped,
-            masked_share: self.rig.cameras.iter().map(RigCamera::masked_share).collect(),
+            masked_share: rig.cameras.iter().map(RigCamera::masked_share).collect(),
             messages_lost: counts.messages_lost,
             poses_rejected: counts.poses_rejected,
             non_finite_windows: counts.non_finite_windows,
