@@ -156,7 +156,7 @@ fn variety_changes_lenses_and_cameras_and_nothing_else() {
 fn looks_change_colours_of_training_clips_only() {
     let config = ModelConfig::preset("tiny").unwrap();
     let usual = small();
-    let varied = ClipOptions { looks: LookOptions { sensor: true }, ..usual };
+    let varied = ClipOptions { looks: LookOptions { sensor: true, ..LookOptions::default() }, ..usual };
     assert_eq!(ClipPlan::of_drive(10_500, &varied), ClipPlan::of_drive(10_500, &usual), "validation is plain");
     let mut changed = 0;
     for k in 0..8 {
@@ -183,4 +183,40 @@ fn looks_change_colours_of_training_clips_only() {
         assert_eq!(values(&one.context.world_from_camera), values(&other.context.world_from_camera));
     }
     assert!(changed >= 6, "{changed} of 8");
+}
+
+#[test]
+fn pose_errors_are_in_what_is_given_and_not_in_what_is_asked_for() {
+    let config = ModelConfig::preset("tiny").unwrap();
+    let usual = small();
+    let varied = ClipOptions { looks: LookOptions { poses: true, ..LookOptions::default() }, ..usual };
+    let mut differ = 0;
+    for k in 0..8 {
+        let one = ClipPlan::training(1, k, &usual).make(&usual, &config).unwrap();
+        let other = ClipPlan::training(1, k, &varied).make(&varied, &config).unwrap();
+        assert_eq!(values(&one.context.image), values(&other.context.image));
+        let (a, b) = (values(&one.context.world_from_camera), values(&other.context.world_from_camera));
+        differ += usize::from(a != b);
+        // 25 ms at 22 m/s, and the poses' own errors.
+        assert!(a.iter().zip(&b).all(|(x, y)| (x - y).abs() < 0.8), "{k}");
+        let target = |clip: &super::clips::TrainClip| values(&clip.target.as_ref().unwrap().0.world_from_camera);
+        assert_eq!(target(&one), target(&other));
+    }
+    assert!(differ >= 3, "{differ} of 8");
+}
+
+#[test]
+fn every_part_of_the_looks_gives_sound_clips() {
+    let config = ModelConfig::preset("tiny").unwrap();
+    for cameras in [1, 2, 3] {
+        let options = ClipOptions { cameras, looks: LookOptions::varied(), ..small() };
+        for k in 0..24 {
+            let clip = ClipPlan::training(5, k, &options).make(&options, &config).unwrap();
+            let truth = &clip.context_truth;
+            let finite = |x: &Tensor| values(x).iter().all(|v| v.is_finite());
+            assert!(finite(&truth.depth) && finite(&truth.flow) && finite(&clip.context.world_from_camera));
+            assert!(values(&truth.depth).iter().zip(values(&truth.sky)).all(|(&d, s)| (d == 0.0) == (s == 1.0)));
+            assert!(values(&clip.context.image).iter().all(|x| (-1.0..=1.0).contains(x)));
+        }
+    }
 }

@@ -11,7 +11,7 @@ use storm_render::Intrinsics;
 use storm_render::world::{Drive, DriveOptions, WorldFrame};
 
 use super::error::TrainError;
-use super::looks::{LookOptions, RigLook, Shutter};
+use super::looks::{LookOptions, PoseErrors, RigLook, Shutter, rig};
 use super::truth::{SkySamples, Truth};
 use crate::clip::{ClipBatch, PixelLayout, ViewInput};
 use crate::config::ModelConfig;
@@ -171,6 +171,9 @@ impl ClipPlan {
             plan.lead_sec = f64::from(rng.random_range(1..=most)) * options.stride_sec;
         }
         plan.looks = options.looks;
+        if plan.looks.rigs {
+            plan.zoom = rig::zoom(plan.drive_seed, options.width, options.height);
+        }
         plan
     }
 
@@ -214,6 +217,7 @@ impl ClipPlan {
             rate_hz: RATE_HZ,
             traffic: self.traffic,
             zoom: self.zoom,
+            looks: self.looks.drive(),
             noise: if rig.is_some() { DITHER } else { usual.noise },
             ..usual
         })?;
@@ -221,9 +225,12 @@ impl ClipPlan {
             &(map_from_camera(&drive, options.reference(), self.start_sec - self.lead_sec) * camera_from_flu()),
         );
         let context_sec: Vec<f64> = (0..options.timesteps).map(|k| k as f64 * options.stride_sec).collect();
-        let shots = |times: &[f64]| self.shots(&drive, rig.as_ref(), times, &anchor_from_map);
-        let context = shots(&context_sec)?;
-        let target = if self.target_sec.is_empty() { None } else { Some(shots(&self.target_sec)?) };
+        let errors = if self.looks.poses { PoseErrors::draw(self.drive_seed) } else { None };
+        // What is asked for is drawn where it truly is; what is given is not known that well.
+        let shots =
+            |times: &[f64], errors| self.shots(&drive, Seen { rig: rig.as_ref(), errors }, times, &anchor_from_map);
+        let context = shots(&context_sec, errors)?;
+        let target = if self.target_sec.is_empty() { None } else { Some(shots(&self.target_sec, None)?) };
         let batch = |shots: &[Vec<Shot>]| -> Result<(ClipBatch, Truth), TrainError> {
             let clip = Shot::clip(shots, options.span_sec)?;
             Ok((clip, Truth::of(shots, &anchor_from_map.matrix3, config)?))
@@ -231,7 +238,7 @@ impl ClipPlan {
         let (mut clip, context_truth) = batch(&context)?;
         if self.prior_sec > 0.0 {
             let times: Vec<f64> = context_sec.iter().map(|t| t - self.prior_sec).collect();
-            clip.prior = Some(Box::new(Shot::clip(&shots(&times)?, options.span_sec)?));
+            clip.prior = Some(Box::new(Shot::clip(&shots(&times, errors)?, options.span_sec)?));
         }
         Ok(TrainClip {
             context: clip,
@@ -245,7 +252,7 @@ impl ClipPlan {
     fn shots(
         &self,
         drive: &Drive,
-        rig: Option<&RigLook>,
+        seen: Seen<'_>,
         times: &[f64],
         anchor_from_map: &DAffine3,
     ) -> Result<Vec<Vec<Shot>>, TrainError> {
@@ -254,22 +261,33 @@ impl ClipPlan {
             let opens = map_from_camera(drive, camera, at);
             let intrinsics = drive.cameras()[camera].intrinsics;
             let mut frame = drive.render(camera, at);
-            if let Some(rig) = rig {
+            if let Some(rig) = seen.rig {
                 let open_sec = rig.open_sec();
                 let closes = map_from_camera(drive, camera, at + open_sec);
                 let shutter = Shutter { intrinsics, opens, closes, open_sec };
                 rig.take(&mut frame, camera, at, (open_sec > 0.0).then_some(&shutter))?;
             }
+            let given = match seen.errors {
+                Some(errors) => map_from_camera(drive, camera, at + errors.late_sec(camera)) * errors.at(camera, at),
+                None => opens,
+            };
             Ok(Shot {
                 frame,
                 intrinsics,
-                anchor_from_camera: affine32(&(*anchor_from_map * opens)),
+                anchor_from_camera: affine32(&(*anchor_from_map * given)),
                 time_sec: (self.lead_sec + time_sec) as f32,
                 valid: None,
             })
         };
         times.iter().map(|&t| (0..drive.cameras().len()).map(|c| shot(c, t)).collect()).collect()
     }
+}
+
+/// How images are taken and poses are known.
+#[derive(Clone, Copy)]
+struct Seen<'a> {
+    rig: Option<&'a RigLook>,
+    errors: Option<PoseErrors>,
 }
 
 /// One picture of a drive and where it was taken in the anchor frame.

@@ -4,13 +4,17 @@ use super::ego::{Profile, Springs};
 use super::ground::Ground;
 use super::layout::{Layout, Town};
 use super::leg::{LegContent, LegStore};
+use super::light::Lamps;
 use super::options::{DriveOptions, WorldError};
 use super::part::PartSpec;
+use super::pull_out::{PullOut, standing};
 use super::rig::{DriveCamera, rig};
 use super::road::District;
 use super::scene::{BODY_REACH_M, BodyKey, BodyState, Frustum, Scene};
 use super::shadow::Shadows;
+use super::skin::Skin;
 use super::sky::Sky;
+use super::solids::{Solid, solids};
 use super::stream::Actor;
 use super::tiles::Tiles;
 use super::trace::Tracer;
@@ -39,12 +43,15 @@ pub struct Drive {
     springs: Springs,
     convoy: Convoy,
     sky: Sky,
+    skin: Option<Skin>,
     brightness: f32,
     legs: LegStore,
+    solids: Vec<Solid>,
 }
 
 /// One camera at one moment, ready to trace.
 pub(crate) struct ViewAt<'a> {
+    skin: Option<&'a Skin>,
     pub scene: Scene,
     pub tiles: Tiles,
     pub camera: &'a Intrinsics,
@@ -57,6 +64,7 @@ impl ViewAt<'_> {
             scene: &self.scene,
             tiles: &self.tiles,
             sky,
+            skin: self.skin,
             camera: self.camera,
             view_from_camera: self.view_from_camera,
         }
@@ -99,16 +107,27 @@ impl Drive {
         let layout = Layout::new(town, (seconds + LEAD_SEC) * TOP_MPS + AHEAD_M);
         let profile = Profile::new(&layout, seconds);
         let convoy = Convoy::new(seed, layout.route.clone(), profile, options.traffic);
-        Ok(Self {
+        let looks = options.looks;
+        let sky = if looks.light { Sky::varied(seed) } else { Sky::new(seed) };
+        let mut drive = Self {
             cameras: rig(options),
             options: options.clone(),
             springs: Springs::new(seed),
-            sky: Sky::new(seed),
-            brightness: dice.range32(1.25, 1.9),
+            brightness: dice.range32(1.25, 1.9) * sky.exposure,
+            sky,
+            skin: Skin::new(seed, looks.textures, looks.light),
             layout,
             convoy,
             legs: LegStore::default(),
-        })
+            solids: Vec::new(),
+        };
+        if looks.solids {
+            drive.solids = solids(seed, options.seconds, |time| {
+                let pose = drive.local_from_base(time);
+                (pose.matrix3, pose.translation)
+            });
+        }
+        Ok(drive)
     }
 
     /// As given to [`Drive::new`].
@@ -150,7 +169,7 @@ impl Drive {
         (p.v, p.a)
     }
 
-    /// All road users within 150 m of the ego, by growing id.
+    /// All road users within 150 m of the ego, by growing id. The solids of [`super::DriveLooks::solids`] are none.
     pub fn movers(&self, time_sec: f64) -> Vec<Mover> {
         let ego = self.local_from_base(time_sec).translation;
         let mut movers = Vec::new();
@@ -162,8 +181,9 @@ impl Drive {
             for (k, body) in leg.bodies.iter().enumerate() {
                 let Some(model) = body.model.filter(|_| body.origin.distance(ego) < MOVERS_M) else { continue };
                 let id = super::dice::fold(self.options.seed, &[2, index as u64, k as u64]);
-                let pose = (body.origin + self.origin(), body.yaw);
-                movers.push(Mover::new(id, body.instance, &model, pose, (DVec3::ZERO, 0.0)));
+                let now = self.leaving(index, &leg, k, time_sec).map_or_else(|| standing(body), |a| BodyState::of(&a));
+                let pose = (now.origin + self.origin(), now.yaw);
+                movers.push(Mover::new(id, body.instance, &model, pose, (now.vel, now.yaw_rate)));
             }
         }
         movers.sort_by_key(|m| m.id);
@@ -176,6 +196,12 @@ impl Drive {
 
     pub(crate) fn sky(&self) -> &Sky {
         &self.sky
+    }
+
+    /// How many solids fly through the drive.
+    #[cfg(test)]
+    pub(crate) fn solid_count(&self) -> usize {
+        self.solids.len()
     }
 
     pub(crate) fn brightness(&self) -> f32 {
@@ -194,6 +220,18 @@ impl Drive {
         let leg = self.leg_index(time);
         let last = self.layout.legs.len().saturating_sub(1);
         (leg.saturating_sub(2)..=(leg + 2).min(last)).map(|i| (i, self.legs.get(&self.layout, i)))
+    }
+
+    /// The parked vehicle `index` of a leg, where it has left its place.
+    fn leaving(&self, leg: usize, content: &LegContent, index: usize, time: f64) -> Option<Actor> {
+        let body = content.bodies.get(index).filter(|_| self.options.looks.pull_out)?;
+        let model = body.model?;
+        let (seed, seconds, hand) = (self.options.seed, self.options.seconds, self.layout.town.hand);
+        let way = PullOut::roll(seed, leg, index, seconds, hand).filter(|way| time > way.span().0)?;
+        // Where it comes to a stand it stays: nobody of the convoy may pass there later.
+        let until = (way.span().0, way.span().1.max(seconds + 1.0));
+        let free = || self.convoy.clear_of(until, |t| way.actor(body, model, t));
+        content.leaves(index, free).then(|| way.actor(body, model, time))
     }
 
     /// Everybody who moves within `reach` metres of `eye`.
@@ -232,16 +270,21 @@ impl Drive {
         let k = &mount.intrinsics;
         let ground = Ground::new(&self.layout, self.leg_index(time), eye);
         let mut scene = Scene::new(eye, ground, frustum(k, &view_from_camera));
+        let mut parts: Vec<PartSpec> = Vec::new();
         for (leg, content) in self.legs_near(time) {
             for (index, body) in content.bodies.iter().enumerate() {
-                if scene.wants(body.origin, body.reach) {
-                    let key = BodyKey::Static { leg: leg as u32, index: index as u32 };
-                    let (origin, yaw, instance) = (body.origin, body.yaw, body.instance);
-                    scene.add(key, &BodyState { origin, yaw, vel: DVec3::ZERO, yaw_rate: 0.0, instance }, &body.parts);
+                let key = BodyKey::Static { leg: leg as u32, index: index as u32 };
+                if let Some(actor) = self.leaving(leg, &content, index, time) {
+                    if scene.wants(actor.pos, body.reach) {
+                        parts.clear();
+                        actor.model.parts(actor.way, actor.speed, &mut parts);
+                        scene.add(key, &BodyState::of(&actor), &parts);
+                    }
+                } else if scene.wants(body.origin, body.reach) {
+                    scene.add(key, &standing(body), &body.parts);
                 }
             }
         }
-        let mut parts: Vec<PartSpec> = Vec::new();
         self.each_actor(time, eye, BODY_REACH_M, |key, actor| {
             let (size, middle) = actor.model.size();
             if scene.wants(actor.pos, (size.length() + middle.abs()) as f32) {
@@ -250,9 +293,17 @@ impl Drive {
                 scene.add(key, &BodyState::of(actor), &parts);
             }
         });
+        for (index, solid) in self.solids.iter().enumerate() {
+            let state = solid.state(time);
+            if scene.wants(state.origin, solid.reach) {
+                scene.add(BodyKey::Solid { index: index as u32 }, &state, &solid.parts(time));
+            }
+        }
         scene.shadows = Shadows::new(&scene.parts, self.sky.sun);
+        let ahead = self.local_from_base(time).matrix3.x_axis.as_vec3();
+        scene.lamps = Lamps::new(&scene.parts, self.sky.lamps, ahead, self.options.seed);
         let tiles = Tiles::new(&scene.parts, &view_from_camera, k);
-        ViewAt { scene, tiles, camera: k, view_from_camera }
+        ViewAt { skin: self.skin.as_ref(), scene, tiles, camera: k, view_from_camera }
     }
 
     /// Where a point fixed to a part of a body is at a time, local frame; `None` for a body or part there is not.
@@ -264,7 +315,17 @@ impl Drive {
             BodyKey::Static { leg, index } => {
                 let content = self.legs.get(&self.layout, leg as usize);
                 let body = content.bodies.get(index as usize)?;
+                if let Some(actor) = self.leaving(leg as usize, &content, index as usize, time) {
+                    let mut parts = Vec::new();
+                    actor.model.parts(actor.way, actor.speed, &mut parts);
+                    return Some(place(actor.pos, actor.yaw, parts.get(part)?));
+                }
                 return Some(place(body.origin, body.yaw, body.parts.get(part)?));
+            }
+            BodyKey::Solid { index } => {
+                let solid = self.solids.get(index as usize)?;
+                let state = solid.state(time);
+                return Some(place(state.origin, state.yaw, solid.parts(time).get(part)?));
             }
             BodyKey::Companion { index } => self.convoy.actor(index as usize, time),
             BodyKey::Slot { leg, flow, slot } => {

@@ -35,6 +35,19 @@ impl LegContent {
         Self { bodies: site.bodies, flows: leg_flows(layout, index), known: Mutex::default() }
     }
 
+    /// Whether a parked vehicle may pull out: `free` says whether nobody of the ego's convoy is in its way, and is asked once.
+    pub(crate) fn leaves(&self, body: usize, free: impl FnOnce() -> bool) -> bool {
+        // No flow has this number.
+        let key = (u32::MAX, body as i64);
+        let lock = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = lock().get(&key).copied();
+        known.unwrap_or_else(|| {
+            let free = free();
+            lock().insert(key, free);
+            free
+        })
+    }
+
     pub(crate) fn exists(&self, flow: usize, slot: i64, convoy: &Convoy, seconds: f64) -> bool {
         let key = (flow as u32, slot);
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);

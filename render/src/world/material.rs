@@ -9,6 +9,8 @@ pub(crate) enum Surface {
     Plain,
     /// One colour that shines a little (metal, plastic).
     Sheen,
+    /// The head of a street lamp: shines a little by day, burns at night.
+    Lamp,
     /// Blotchy colour (cloth, bark).
     Rough,
     /// Leaves: clumps of light and dark.

@@ -12,6 +12,8 @@ mod ego;
 mod ground;
 mod layout;
 mod leg;
+mod light;
+mod looks;
 mod material;
 mod noise;
 mod options;
@@ -20,6 +22,7 @@ mod part;
 mod path;
 mod people;
 mod picture;
+mod pull_out;
 mod rig;
 mod road;
 mod scene;
@@ -27,7 +30,9 @@ mod sensor;
 mod shadow;
 mod shapes;
 mod site;
+mod skin;
 mod sky;
+mod solids;
 mod stream;
 mod street;
 mod texture;
@@ -38,6 +43,7 @@ mod truth;
 mod vehicles;
 
 pub use drive::Drive;
+pub use looks::DriveLooks;
 pub use options::{CAMERAS_MAX, DriveOptions, SECONDS_MAX, SIDE_MAX, WorldError};
 pub use picture::WorldFrame;
 pub use rig::DriveCamera;
@@ -51,5 +57,5 @@ pub const MOVING_MPS: f32 = 0.01;
 
 #[cfg(test)]
 mod tests;
-#[cfg(test)]
+#[cfg(all(test, target_os = "linux", target_env = "gnu", target_arch = "x86_64"))]
 mod usual;

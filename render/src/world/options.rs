@@ -1,5 +1,6 @@
 //! What a drive is asked to be, and what is refused.
 
+use super::looks::DriveLooks;
 use thiserror::Error;
 
 /// Most cameras a rig carries.
@@ -38,6 +39,8 @@ pub struct DriveOptions {
     pub zoom: [f32; 2],
     /// Whether edges are smoothed by extra rays (colour only; depth, flow and labels always belong to the pixel's centre).
     pub smooth_edges: bool,
+    /// What of the look varies beyond the usual.
+    pub looks: DriveLooks,
 }
 
 impl Default for DriveOptions {
@@ -56,6 +59,7 @@ impl Default for DriveOptions {
             traffic: 1.0,
             zoom: [1.0; 2],
             smooth_edges: true,
+            looks: DriveLooks::default(),
         }
     }
 }

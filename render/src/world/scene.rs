@@ -1,6 +1,7 @@
 //! The world at one moment as seen from one eye: solids placed relative to the eye in `f32`, the ground, and what casts shadows.
 
 use super::ground::Ground;
+use super::light::Lamps;
 use super::material::Material;
 use super::part::PartSpec;
 use super::shadow::Shadows;
@@ -19,6 +20,7 @@ pub(crate) enum BodyKey {
     Static { leg: u32, index: u32 },
     Companion { index: u32 },
     Slot { leg: u32, flow: u32, slot: i64 },
+    Solid { index: u32 },
 }
 
 /// A solid placed relative to the eye, axes as the map's.
@@ -84,12 +86,13 @@ pub(crate) struct Scene {
     pub parts: Vec<Part>,
     pub ground: Ground,
     pub shadows: Shadows,
+    pub lamps: Lamps,
     frustum: Frustum,
 }
 
 impl Scene {
     pub(crate) fn new(eye: DVec3, ground: Ground, frustum: Frustum) -> Self {
-        Self { eye, parts: Vec::new(), ground, shadows: Shadows::default(), frustum }
+        Self { eye, parts: Vec::new(), ground, shadows: Shadows::default(), lamps: Lamps::default(), frustum }
     }
 
     /// Whether a body whose parts lie within `reach` of `origin` matters for the picture.

@@ -2,6 +2,7 @@
 //! a grid perpendicular to them, and a ray looks into one cell.
 
 use super::scene::Part;
+use super::skin::Skin;
 use glam::{Vec2, Vec3};
 
 /// Half the grid's side and a cell's side, metres. Outside the grid everything is lit.
@@ -65,7 +66,7 @@ impl Shadows {
 
     /// Whether something stands between a surface point and the sun.
     #[inline]
-    pub(crate) fn dark(&self, parts: &[Part], p: Vec3, normal: Vec3) -> bool {
+    pub(crate) fn dark(&self, parts: &[Part], p: Vec3, normal: Vec3, skin: Option<&Skin>) -> bool {
         let q = (Vec2::new(self.across[0].dot(p), self.across[1].dot(p)) + REACH_M) / CELL_M;
         if !(q.x >= 0.0 && q.y >= 0.0 && q.x < CELLS as f32 && q.y < CELLS as f32) {
             return false;
@@ -76,7 +77,10 @@ impl Shadows {
             let part = &parts[i as usize];
             let inv = part.rot.transpose();
             let (o, d) = (inv * (start - part.pos), inv * self.sun);
-            part.shape.hit(o, d).is_some()
+            part.shape.hit(o, d).is_some_and(|(t, _)| {
+                // Light falls through the holes of foliage.
+                !skin.is_some_and(|skin| skin.open(&part.material, o + d * t, 0.0))
+            })
         })
     }
 }

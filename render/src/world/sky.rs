@@ -13,16 +13,21 @@ pub(crate) struct Sky {
     /// Light from above and from below.
     pub above: Vec3,
     pub below: Vec3,
-    zenith: Vec3,
+    pub zenith: Vec3,
     pub horizon: Vec3,
-    cloud_color: Vec3,
+    pub cloud_color: Vec3,
     /// Cloud noise above this is cloud: -1 all, 1 none.
-    clear: f32,
+    pub clear: f32,
     drift: Vec2,
     seed: u32,
     /// Per metre.
     haze: f32,
-    disc: bool,
+    /// Whether the sun is seen.
+    pub disc: bool,
+    /// How bright street lamps, lit windows and headlights are; 0 by day.
+    pub lamps: f32,
+    /// Factor on the cameras' brightness: what they make of so little light.
+    pub exposure: f32,
 }
 
 impl Sky {
@@ -67,6 +72,8 @@ impl Sky {
             seed: dice.next() as u32,
             haze: if dice.chance(0.2) { dice.range32(0.003, 0.009) } else { dice.range32(0.0005, 0.0025) },
             disc: !overcast,
+            lamps: 0.0,
+            exposure: 1.0,
         }
     }
 

@@ -98,7 +98,7 @@ fn lamp(dice: &mut Dice) -> Vec<PartSpec> {
     let h = dice.range32(5.5, 9.0);
     let arm = dice.range32(0.8, 2.0);
     let pole = Shape::Cylinder { radius: 0.075, half: 0.5 * h, hole: 0.0 };
-    let head = Material::new(Surface::Sheen, rgb(210, 210, 205));
+    let head = Material::new(Surface::Lamp, rgb(210, 210, 205));
     vec![
         PartSpec::fixed(pole, Vec3::new(0.0, 0.0, 0.5 * h), metal),
         PartSpec::bar(Vec3::new(0.0, 0.0, h), Vec3::new(0.0, -arm, h + 0.3), 0.05, metal),

@@ -30,7 +30,7 @@ impl Look {
 
 /// Coordinates on the face whose normal is nearest to `n`: across and up.
 #[inline]
-fn face(p: Vec3, n: Vec3) -> Vec2 {
+pub(crate) fn face(p: Vec3, n: Vec3) -> Vec2 {
     let a = n.abs();
     if a.z >= a.x && a.z >= a.y {
         Vec2::new(p.x, p.y)
@@ -47,12 +47,14 @@ fn glass() -> Look {
     Look { albedo: GLASS, gloss: 0.12, glow: Vec3::ZERO }
 }
 
-/// The look of a solid at local point `p` with local normal `n`; `half` is the solid's box, `foot` the pixel's width there.
-pub(crate) fn look(m: &Material, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Look {
+/// The look of a solid at local point `p` with local normal `n`; `half` is the solid's box, `foot` the pixel's width there;
+/// `lamps` says how bright lamps and lit windows are (0 by day).
+pub(crate) fn look(m: &Material, p: Vec3, n: Vec3, half: Vec3, foot: f32, lamps: f32) -> Look {
     let uv = face(p, n);
     match m.surface {
         Surface::Plain => Look::matt(m.color * (1.0 + 0.06 * grain(uv, 9.0, foot, m.seed))),
         Surface::Sheen => Look { albedo: m.color, gloss: 0.06, glow: Vec3::ZERO },
+        Surface::Lamp => Look { albedo: m.color, gloss: 0.06, glow: m.color * (3.0 * lamps) },
         Surface::Rough => {
             Look::matt(m.color * (1.0 + 0.3 * grain(uv, 12.0, foot, m.seed) + 0.15 * grain(uv, 4.0, foot, m.seed ^ 5)))
         }
@@ -77,7 +79,7 @@ pub(crate) fn look(m: &Material, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Loo
             let tone = cell(Vec2::new(uv.x / step, 0.0), m.seed);
             Look::matt(m.color * (1.0 + 0.15 * tone * near + 0.08 * grain(uv, 2.0, foot, m.seed)) * (1.0 - 0.6 * gap))
         }
-        Surface::Facade(f) => facade(m, &f, p, n, half, foot),
+        Surface::Facade(f) => facade(m, &f, p, n, half, foot, lamps),
         Surface::Body { axles, arch } => body(m, axles, arch, p, n, half, foot),
         Surface::Cabin => cabin(m, p, n, half, foot),
         Surface::Coach { glass, stripe } => coach(m, glass, stripe, p, n, half, foot),
@@ -92,7 +94,7 @@ pub(crate) fn look(m: &Material, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Loo
     }
 }
 
-fn facade(m: &Material, f: &Facade, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> Look {
+fn facade(m: &Material, f: &Facade, p: Vec3, n: Vec3, half: Vec3, foot: f32, lamps: f32) -> Look {
     if n.z.abs() > 0.5 {
         return Look::matt(Vec3::splat(0.16) * (1.0 + 0.3 * grain(p.truncate(), 1.0, foot, m.seed)));
     }
@@ -135,7 +137,8 @@ fn facade(m: &Material, f: &Facade, p: Vec3, n: Vec3, half: Vec3, foot: f32) -> 
         return Look::matt(wall).mix(Look::matt(paint), door);
     }
     let bar = pulse(x, 0.485, 0.515, fx) * 0.8;
-    let pane_look = Look { albedo: inside, gloss: 0.14, glow: Vec3::ZERO }.mix(Look::matt(m.accent * 0.7), bar);
+    let lit = if tone > 0.55 { Vec3::new(0.3, 0.22, 0.12) * (lamps * near) } else { Vec3::ZERO };
+    let pane_look = Look { albedo: inside, gloss: 0.14, glow: lit }.mix(Look::matt(m.accent * 0.7), bar);
     look.mix(pane_look, pane)
 }
 

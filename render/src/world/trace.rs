@@ -3,6 +3,7 @@
 use super::ground::GroundHit;
 use super::paint;
 use super::scene::Scene;
+use super::skin::Skin;
 use super::sky::Sky;
 use super::texture::{self, Look};
 use super::tiles::Tiles;
@@ -53,6 +54,7 @@ pub(crate) struct Tracer<'a> {
     pub scene: &'a Scene,
     pub tiles: &'a Tiles,
     pub sky: &'a Sky,
+    pub skin: Option<&'a Skin>,
     pub camera: &'a Intrinsics,
     pub view_from_camera: Mat3,
 }
@@ -73,8 +75,10 @@ impl Tracer<'_> {
                 continue;
             }
             let part = &self.scene.parts[seen.part as usize];
-            if let Some((at, n)) = part.shape.hit(seen.eye, seen.turn * ray)
+            let local = seen.turn * ray;
+            if let Some((at, n)) = part.shape.hit(seen.eye, local)
                 && at < t
+                && !self.skin.is_some_and(|skin| skin.open(&part.material, seen.eye + local * at, at / self.camera.fx))
             {
                 (t, found, normal) = (at, seen.part, n);
             }
@@ -94,21 +98,43 @@ impl Tracer<'_> {
         let pixel = 1.0 / self.camera.fx;
         let (look, normal, t): (Look, Vec3, f32) = match hit {
             Hit::Sky => return (self.sky.color(dir), false),
-            Hit::Ground(hit) => (paint::look(&self.scene.ground, hit, d, pixel), hit.normal, hit.t),
+            Hit::Ground(hit) => {
+                let own = paint::look(&self.scene.ground, hit, d, pixel);
+                let look = match self.skin {
+                    Some(skin) => {
+                        let world = d.truncate() * hit.t + self.scene.ground.anchor;
+                        let across = hit.t * length * pixel;
+                        // As for paint: the mean of what a pixel covers along the view and across it.
+                        let foot = across / (-dir.z).max(0.01).sqrt();
+                        skin.ground(own, hit, world, foot)
+                    }
+                    None => own,
+                };
+                (look, hit.normal, hit.t)
+            }
             Hit::Part { t, part, normal } => {
                 let part = &self.scene.parts[*part as usize];
                 let world = part.rot * *normal;
                 let facing = world.dot(dir).abs().max(0.12);
                 let local = part.rot.transpose() * (d * *t - part.pos);
                 let foot = t * pixel / facing.sqrt();
-                (texture::look(&part.material, local, *normal, part.shape.bounds(), foot), world, *t)
+                let own = texture::look(&part.material, local, *normal, part.shape.bounds(), foot, self.sky.lamps);
+                let look = match self.skin {
+                    Some(skin) => skin.solid(own, &part.material, local, *normal, foot),
+                    None => own,
+                };
+                (look, world, *t)
             }
         };
         let p = d * t;
         let faces_sun = normal.dot(self.sky.sun) > 0.0;
-        let lit = if faces_sun && !self.scene.shadows.dark(&self.scene.parts, p, normal) { 1.0 } else { 0.0 };
+        let lit =
+            if faces_sun && !self.scene.shadows.dark(&self.scene.parts, p, normal, self.skin) { 1.0 } else { 0.0 };
         // Where the sun does not reach, less of the sky does either.
         let mut color = look.albedo * self.sky.light(normal, lit) * (0.86 + 0.14 * lit) + look.glow;
+        if self.sky.lamps > 0.0 {
+            color += look.albedo * self.scene.lamps.light(p, normal);
+        }
         if look.gloss > 0.0 {
             let mirror = dir - 2.0 * dir.dot(normal) * normal;
             let x = 1.0 + dir.dot(normal).min(0.0);

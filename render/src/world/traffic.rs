@@ -356,6 +356,16 @@ impl Convoy {
         1 + self.companions.len()
     }
 
+    /// Whether somebody who is `actor(time)` keeps clear of the ego and its companions from `from` to `to`, seconds.
+    pub(crate) fn clear_of(&self, (from, to): (f64, f64), actor: impl Fn(f64) -> Actor) -> bool {
+        let steps = ((to - from) / 0.1).ceil().max(0.0) as usize;
+        (0..=steps).all(|k| {
+            let time = from + 0.1 * k as f64;
+            let own = actor(time).footprint(2.0 * CLEAR_M);
+            (0..self.members()).all(|member| !own.overlaps(&self.footprint(member, time)))
+        })
+    }
+
     /// The ego's companions at a time.
     pub(crate) fn actors(&self, time: f64) -> impl Iterator<Item = Actor> + '_ {
         (0..self.companions.len()).map(move |i| self.actor(i, time))

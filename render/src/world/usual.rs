@@ -16,7 +16,6 @@ fn hash(frame: &WorldFrame) -> u64 {
 
 /// The held-out suite, the demo and synthesised bags keep their images: figures of earlier versions stay comparable. Sines
 /// and powers come from the platform's mathematics library, so the bytes are those of one platform.
-#[cfg(all(target_os = "linux", target_env = "gnu", target_arch = "x86_64"))]
 #[test]
 fn the_usual_look_keeps_its_bytes() {
     let at = |seed: u64, cameras: usize, zoom: [f32; 2], time: f64| {

@@ -4,13 +4,17 @@
 mod camera;
 mod jpeg;
 mod motion;
+mod poses;
+pub(super) mod rig;
 #[cfg(test)]
 mod tests;
 
 use serde::{Deserialize, Serialize};
+use storm_render::world::DriveLooks;
 
 pub(super) use camera::RigLook;
 pub(super) use motion::Shutter;
+pub(super) use poses::PoseErrors;
 
 /// What varies from clip to clip. The default is plain: nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -19,12 +23,32 @@ pub struct LookOptions {
     /// The cameras: grey or colour, white balance, exposure and its drift, vignetting, tone curve, blur by focus and by motion,
     /// noise, JPEG.
     pub sensor: bool,
+    /// The drive's light: skies, low sun, night with lamps, wet roads.
+    pub light: bool,
+    /// The drive's textures: roughness of every scale, colours, patterns, foliage with holes.
+    pub textures: bool,
+    /// Solids that fly through a fifth of the drives.
+    pub solids: bool,
+    /// Parked vehicles that pull out into the lane.
+    pub pull_out: bool,
+    /// Layouts, tilts and lenses of real vehicles' cameras.
+    pub rigs: bool,
+    /// Small errors of the poses that the network is given.
+    pub poses: bool,
 }
 
 /// The names of the parts with where they are kept.
 type Part = (&'static str, fn(&mut LookOptions) -> &mut bool);
 
-const PARTS: [Part; 1] = [("sensor", |x| &mut x.sensor)];
+const PARTS: [Part; 7] = [
+    ("sensor", |x| &mut x.sensor),
+    ("light", |x| &mut x.light),
+    ("textures", |x| &mut x.textures),
+    ("solids", |x| &mut x.solids),
+    ("pull_out", |x| &mut x.pull_out),
+    ("rigs", |x| &mut x.rigs),
+    ("poses", |x| &mut x.poses),
+];
 
 impl LookOptions {
     /// Everything varies.
@@ -53,6 +77,12 @@ impl LookOptions {
             *part(&mut looks) = true;
         }
         Ok(looks)
+    }
+
+    /// What of it is the drive's business.
+    pub fn drive(&self) -> DriveLooks {
+        let Self { light, textures, solids, pull_out, rigs, .. } = *self;
+        DriveLooks { light, textures, solids, pull_out, rigs }
     }
 
     /// The names of what varies, as [`LookOptions::parse`] takes them.

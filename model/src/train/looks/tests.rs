@@ -20,7 +20,9 @@ fn shutter(drive: &Drive, open_sec: f64) -> Shutter {
 
 #[test]
 fn names_are_read_and_written_and_wrong_ones_refused() {
-    for looks in [LookOptions::default(), LookOptions::varied(), LookOptions { sensor: true }] {
+    for looks in
+        [LookOptions::default(), LookOptions::varied(), LookOptions { sensor: true, poses: true, ..Default::default() }]
+    {
         assert_eq!(LookOptions::parse(&looks.describe()), Ok(looks));
     }
     assert_eq!(LookOptions::default().describe(), "plain");
@@ -120,4 +122,34 @@ fn a_blurred_image_keeps_its_mean_and_an_unmoved_one_its_bytes() {
     for k in 0..5 {
         assert!((moved[9 - k].x + moved[10 + k].x - 1.0).abs() < 1e-5);
     }
+}
+
+#[test]
+fn pose_errors_are_small_repeat_and_differ() {
+    use super::PoseErrors;
+    let drawn: Vec<PoseErrors> = (0..200).filter_map(PoseErrors::draw).collect();
+    assert!((110..170).contains(&drawn.len()), "{} of 200", drawn.len());
+    for e in &drawn {
+        for camera in 0..3 {
+            let (a, b) = (e.at(camera, 1.0), e.at(camera, 1.5));
+            assert_eq!(a, e.at(camera, 1.0));
+            assert_ne!(a, b);
+            // Six deviations of each part.
+            let (axis, angle) = glam::DQuat::from_mat3(&a.matrix3).to_axis_angle();
+            assert!(axis.is_finite() && angle < 6.0 * 0.004 * 1.8 && a.translation.length() < 6.0 * 0.02 * 1.8);
+            assert!(e.late_sec(camera).abs() <= 0.025);
+        }
+        assert_ne!(e.at(0, 1.0), e.at(1, 1.0));
+    }
+}
+
+#[test]
+fn lenses_are_wide_or_narrow_and_pixels_not_square() {
+    let zooms: Vec<[f32; 2]> = (0..300).map(|seed| super::rig::zoom(seed, 240, 160)).collect();
+    let degrees = |z: f32| 2.0 * ((25.0f32).to_radians().tan() / z).atan().to_degrees();
+    assert!(zooms.iter().all(|z| (34.9..105.1).contains(&degrees(z[0]))));
+    // 3.3 : 1 squeezed into 3 : 2 stretches what stands upright by 2.2.
+    let tall = zooms.iter().filter(|z| (z[1] / z[0] - 2.2).abs() < 1e-3).count();
+    assert!((25..65).contains(&tall), "{tall} of 300");
+    assert!(zooms.iter().any(|z| z[1] < z[0]));
 }

@@ -44,8 +44,8 @@ pub struct RecipeArgs {
     /// than the drives' [small: varied, paper: own].
     #[arg(long, value_parser = ["own", "varied"])]
     lenses: Option<String>,
-    /// What of the look of the drives' clips varies from clip to clip: plain (nothing), varied (everything), or some of sensor
-    /// with commas between them. Validation stays plain.
+    /// What of the look of the drives' clips varies from clip to clip: plain (nothing), varied (everything), or some of sensor, light,
+    /// textures, solids, pull_out, rigs, poses with commas between them. Validation stays plain.
     #[arg(long, default_value = "plain", value_parser = LookOptions::parse)]
     looks: LookOptions,
     /// Strides that the anchor of half the drives' clips may lie before their first timestep, the clock beginning there, for
