@@ -6,6 +6,7 @@ use std::path::Path;
 use thiserror::Error;
 
 use super::Config;
+use super::nearest::{no_parameter, with_suggestion};
 
 /// What can be wrong with a configuration.
 #[derive(Debug, Error)]
@@ -77,7 +78,8 @@ impl Config {
     /// Parses and checks YAML text.
     pub fn from_yaml(text: &str) -> Result<Self, ConfigError> {
         check_depth("text", text)?;
-        let parse = |e: serde_yaml::Error| ConfigError::Parse { path: "text".into(), message: e.to_string() };
+        let parse =
+            |e: serde_yaml::Error| ConfigError::Parse { path: "text".into(), message: with_suggestion(&e.to_string()) };
         let value: serde_yaml::Value = serde_yaml::from_str(text).map_err(parse)?;
         let config: Self = match ros_parameters(&value) {
             Some(inner) => serde_yaml::from_value(inner.clone()).map_err(parse)?,
@@ -113,7 +115,7 @@ impl Config {
         let value: serde_yaml::Value = serde_yaml::from_str(value).map_err(parse)?;
         match tree.get_mut(section).and_then(|s| s.get_mut(key)) {
             Some(place) => *place = value,
-            None => return Err(wrong(format!("no parameter {name}; `storm config` lists them"))),
+            None => return Err(wrong(no_parameter(name.trim()))),
         }
         let config: Self = serde_yaml::from_value(tree).map_err(parse)?;
         config.validate()?;

@@ -5,6 +5,7 @@
 
 mod docs;
 mod file;
+mod nearest;
 mod parameters;
 mod rectified;
 mod section;

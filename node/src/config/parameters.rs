@@ -2,6 +2,7 @@
 
 use serde_json::Value;
 
+use super::nearest::no_parameter;
 use super::{Config, ConfigError};
 
 /// Keys that take effect while a node runs; the others at its start alone.
@@ -44,7 +45,7 @@ impl Config {
         let mut tree = serde_json::to_value(self).map_err(|e| wrong(e.to_string()))?;
         let place = name.split_once('.').and_then(|(section, key)| tree.get_mut(section)?.get_mut(key));
         let Some(place) = place else {
-            return Err(wrong(format!("no parameter {name}; `storm config` lists them")));
+            return Err(wrong(no_parameter(name)));
         };
         *place = match value.as_array() {
             Some(flat) if name == "input.base_from_camera" && !flat.iter().any(Value::is_array) => {
