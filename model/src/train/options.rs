@@ -166,6 +166,11 @@ impl TrainOptions {
 
     /// One line on what weights trained so have seen, for their metadata.
     pub fn describe(&self) -> String {
+        format!("{}; {}", self.history, self.describe_run())
+    }
+
+    /// The same of this run alone, without what the weights were before.
+    pub fn describe_run(&self) -> String {
         let mut labels = Vec::new();
         if self.stage != Stage::Render {
             let flow = if self.pixel.flow > 0.0 { "with ground-truth flow labels" } else { "no flow labels" };
@@ -185,8 +190,7 @@ impl TrainOptions {
         let labels = labels.join(" + ");
         let c = &self.clips;
         format!(
-            "{}; {labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}{}{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
-            self.history,
+            "{labels}; procedural drives of data seed {}, {} cameras x {} timesteps of {}x{} (first {} steps one camera), each clip shown {} times{}{}{}; batch {}, {}, peak rate {:e}, schedule of {} steps",
             self.seed,
             c.cameras,
             c.timesteps,

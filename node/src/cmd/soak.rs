@@ -123,9 +123,17 @@ fn with_faults(args: &Args, options: FaultSoak, progress: bool) -> Result<Outcom
     Ok(if report.holds() { Outcome::Done } else { Outcome::Lost })
 }
 
+/// Counts as `merged 12, created 3`; those of nothing are left out.
+fn counts(of: &impl serde::Serialize) -> String {
+    let value = serde_json::to_value(of).unwrap_or_default();
+    let items = value.as_object().into_iter().flatten().filter(|(_, n)| n.as_u64() != Some(0));
+    let items: Vec<String> = items.map(|(name, n)| format!("{} {n}", name.replace('_', " "))).collect();
+    if items.is_empty() { "none".into() } else { items.join(", ") }
+}
+
 fn print_faults(r: &FaultReport) {
-    say!("seed {}: {:.0} s in {:.0} s; faults {:?}", r.seed, r.seconds, r.wall_sec, r.injected);
-    say!("{} images sent, {} used, dropped {:?}", r.images_sent, r.images_used, r.dropped);
+    say!("seed {}: {:.0} s in {:.0} s; faults {}", r.seed, r.seconds, r.wall_sec, counts(&r.injected));
+    say!("{} images sent, {} used, dropped {}", r.images_sent, r.images_used, counts(&r.dropped));
     say!(
         "{} sets, {} steps ({} not computed), {} published, {:.0} MB; {} windows lost to panics, {} clock jumps, {} poses refused",
         r.sets,
@@ -224,13 +232,13 @@ fn print(r: &SoakReport) {
         );
     }
     say!(
-        "map      {} Gaussians, {:.0} MB in memory, {:.0} MB on disk; {:?}",
+        "map      {} Gaussians, {:.0} MB in memory, {:.0} MB on disk; {}",
         r.map_gaussians,
         r.map_mb,
         r.map_disk_mb,
-        r.map
+        counts(&r.map)
     );
-    say!("tracks   {} alive at most; {:?}", r.live_tracks, r.tracks);
+    say!("tracks   {} alive at most; {}", r.live_tracks, counts(&r.tracks));
     let show = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.3}"));
     if let Some(q) = &r.map_quality {
         say!(

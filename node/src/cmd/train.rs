@@ -146,12 +146,13 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let mut trainer = start(args, &device)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make folder {}", args.out.display()))?;
     let total = trainer.options().schedule.steps.min(args.stop_at.unwrap_or(u64::MAX));
+    // The whole history of the weights (thousands of letters where they were trained on and on) goes into the weights file.
     info!(
         "{}: {} weights, step {} of {total}; {}",
         trainer.config().describe(),
         trainer.weight_count(),
         trainer.steps_done(),
-        trainer.options().describe()
+        trainer.options().describe_run()
     );
     let mut curves = Curves::open(&args.out, trainer.steps_done())?;
     let mut recordings = Recordings::open(&mut trainer, &args.out, &device)?;

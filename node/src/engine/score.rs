@@ -48,15 +48,20 @@ impl Scores {
     /// One line for the terminal.
     pub fn line(&self) -> String {
         let text = |x: Option<f64>| x.map_or("-".to_string(), |x| format!("{x:.2}"));
-        format!(
-            "held-out images: {}; PSNR {} dB (nearest context image {} dB), SSIM {}, depth RMSE {} m, EPE3D {} m/s",
+        let mut line = format!(
+            "held-out images: {}; PSNR {} dB (nearest context image {} dB), SSIM {}",
             self.images,
             text(self.storm.psnr),
             text(self.nearest_context.psnr),
             text(self.storm.ssim),
-            text(self.storm.depth_rmse),
-            text(self.storm.epe3d),
-        )
+        );
+        // Figures that want ground truth are left out where there is none.
+        for (name, value, unit) in [("depth RMSE", self.storm.depth_rmse, "m"), ("EPE3D", self.storm.epe3d, "m/s")] {
+            if let Some(value) = value {
+                line += &format!(", {name} {value:.2} {unit}");
+            }
+        }
+        line
     }
 }
 

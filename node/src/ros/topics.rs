@@ -36,6 +36,15 @@ pub enum LivePose {
     Tf,
 }
 
+impl std::fmt::Display for LivePose {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Message { topic, type_name } => write!(f, "{topic} ({type_name})"),
+            Self::Tf => f.write_str("/tf"),
+        }
+    }
+}
+
 /// All inputs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LivePlan {

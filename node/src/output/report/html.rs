@@ -72,10 +72,36 @@ pub(super) fn file_size(bytes: u64) -> String {
     }
 }
 
-/// Hours, minutes and seconds of the UTC day, to the millisecond: what tells steps apart at a glance.
-pub(super) fn time_of_day(stamp_ns: i64) -> String {
-    let ms = stamp_ns.div_euclid(1_000_000).rem_euclid(86_400_000);
-    format!("{:02}:{:02}:{:02}.{:03}", ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60, ms % 1000)
+/// Date and time of a stamp in UTC, to the millisecond. A stamp of the first year of the epoch is no date but the time since a
+/// simulation or a machine began: then the seconds.
+pub(super) fn utc(stamp_ns: i64) -> String {
+    let ms = stamp_ns.div_euclid(1_000_000);
+    if (0..FIRST_YEAR_MS).contains(&ms) {
+        return format!("{}.{:03} s", ms / 1000, ms % 1000);
+    }
+    let (year, month, day) = date(ms.div_euclid(DAY_MS));
+    let ms = ms.rem_euclid(DAY_MS);
+    let (h, m, s) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
+    format!("{year}-{month:02}-{day:02} {h:02}:{m:02}:{s:02}.{:03} UTC", ms % 1000)
+}
+
+/// Milliseconds of a day.
+const DAY_MS: i64 = 86_400_000;
+/// Milliseconds of 1970.
+const FIRST_YEAR_MS: i64 = 365 * DAY_MS;
+
+/// Year, month and day of the Gregorian calendar, `days` after 1970-01-01 (H. Hinnant, "chrono-compatible low-level date
+/// algorithms": years are counted from March, so that the leap day is the last).
+fn date(days: i64) -> (i64, i64, i64) {
+    let from_march_0 = days + 719_468;
+    let era = from_march_0.div_euclid(146_097);
+    let day_of_era = from_march_0.rem_euclid(146_097);
+    let year_of_era = (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let month_from_march = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
+    let month = if month_from_march < 10 { month_from_march + 3 } else { month_from_march - 9 };
+    (year_of_era + era * 400 + i64::from(month <= 2), month, day)
 }
 
 #[cfg(test)]
@@ -96,7 +122,9 @@ mod tests {
         });
         assert_eq!([0.424, 12.4, 1250.0].map(duration).join(" "), "0.42 ms 12 ms 1.25 s");
         assert_eq!([999, 1500, 12_300_000, 5_000_000_000].map(file_size).join(" "), "999 B 1.5 kB 12.3 MB 5.00 GB");
-        assert_eq!(time_of_day(1_700_000_000_123_000_000), "22:13:20.123");
-        assert_eq!(time_of_day(-1), "23:59:59.999");
+        assert_eq!(utc(1_700_000_000_123_000_000), "2023-11-14 22:13:20.123 UTC");
+        assert_eq!(utc(951_782_400_000_000_000), "2000-02-29 00:00:00.000 UTC");
+        assert_eq!(utc(-1), "1969-12-31 23:59:59.999 UTC");
+        assert_eq!(utc(12_345_000_000), "12.345 s");
     }
 }

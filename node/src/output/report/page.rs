@@ -1,7 +1,7 @@
 //! The page, section by section.
 
 use super::chart::timing_chart;
-use super::html::{duration, escape, file_size, number, relative_address, time_of_day};
+use super::html::{duration, escape, file_size, number, relative_address, utc};
 use super::top_view::top_view_figure;
 use super::{ErrorTable, OutputError, Report, ReportCamera, ReportStep, WeightsState};
 use crate::output::tum::seconds_text;
@@ -111,7 +111,7 @@ fn one_step(step: &ReportStep, first: bool) -> Result<String, OutputError> {
         if first || step.cameras.len() <= 3 { "open" } else { "" },
         step.index,
         seconds_text(step.stamp_ns),
-        time_of_day(step.stamp_ns),
+        utc(step.stamp_ns),
         escape(&step.note)
     ))
 }

@@ -109,7 +109,7 @@ impl Running {
             info!("camera {i}: {} with {}", c.image, c.info);
         }
         plan.left_out.iter().for_each(|l| info!("no camera: {l}"));
-        info!("pose: {:?}", plan.pose);
+        info!("pose: {}", plan.pose);
         self.streams = streams(&plan, &self.config.live);
         for (number, stream) in self.streams.iter().enumerate() {
             stream.subscribe(&mut self.node, &self.pool.spawner(), number, &self.arrivals)?;
