@@ -48,6 +48,15 @@ fn a_run_killed_at_any_moment_leaves_a_whole_map() {
     let shown = show_map(&out.join("map"), &["--out", ply.to_str().unwrap()]);
     assert_eq!(code(&shown), 0, "{}", stderr(&shown));
     assert!(!read_ply(&ply).unwrap().cloud.is_empty());
+    // The results folder, its map/ and a PLY are all a map.
+    for map in [&out, &out.join("map"), &ply] {
+        let shown = show_map(map, &[]);
+        assert_eq!(code(&shown), 0, "{}: {}", map.display(), stderr(&shown));
+        let png = dir.path().join("view.png");
+        let view = ["--pose", "0,0,1,0", "--width", "64", "--height", "48", "--out", png.to_str().unwrap()];
+        let drawn = storm(&[&["render", map.to_str().unwrap()], &view[..]].concat());
+        assert_eq!(code(&drawn), 0, "{}: {}", map.display(), stderr(&drawn));
+    }
     // Going on from it is possible, in a folder of its own.
     let next = dir.path().join("next");
     let load = format!("map.load={}", out.join("map").display());

@@ -1,17 +1,19 @@
 //! Gaussians read back from a results folder: the map, or one step.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use glam::{DQuat, DVec3, Quat, Vec3};
 
 use crate::bag::Bag;
 use crate::cdr::decode as cdr;
+use crate::map::StaticMap;
 use crate::msg::PointCloud2;
 use crate::output::objects_csv::{OBJECTS_FOLDER, read_objects};
 use crate::output::ply::{PlyCloud, read_ply};
 use crate::pipeline::messages::ANCHOR_FRAME;
+use crate::pipeline::replay::MAP_FOLDER;
 use crate::pipeline::sink::PREFIX;
 use crate::rigid::Rigid;
 use crate::sync::clock::seconds_between;
@@ -107,6 +109,44 @@ impl SavedGaussians {
         pick(&mut c.quats, &kept);
         pick(&mut self.motion_ids, &kept);
     }
+}
+
+/// What a path given as a map names.
+#[derive(Debug, PartialEq, Eq)]
+pub enum MapPlace {
+    /// The folder of a map's own files.
+    Folder(PathBuf),
+    /// A PLY file.
+    Ply(PathBuf),
+}
+
+/// Finds the map of a results folder, of its `map/`, or of a PLY file; `whole` prefers the map's own files to `map.ply`, which may be
+/// thinned out. None when there is no map.
+pub fn find_map(path: &Path, whole: bool) -> Option<MapPlace> {
+    if !path.is_dir() {
+        return path.is_file().then(|| MapPlace::Ply(path.to_owned()));
+    }
+    if StaticMap::is_saved_in(path) {
+        return Some(MapPlace::Folder(path.to_owned()));
+    }
+    let (folder, ply) = (path.join(MAP_FOLDER), path.join("map.ply"));
+    let folder = StaticMap::is_saved_in(&folder).then_some(MapPlace::Folder(folder));
+    let ply = ply.is_file().then_some(MapPlace::Ply(ply));
+    if whole { folder.or(ply) } else { ply.or(folder) }
+}
+
+/// Reads a map's own files.
+pub fn load_map(folder: &Path) -> Result<SavedGaussians> {
+    let cloud = StaticMap::open(folder, false)?.0.cloud()?;
+    let map_from_local = Rigid::new(DQuat::IDENTITY, cloud.origin);
+    let cloud = PlyCloud {
+        positions: cloud.positions,
+        colors01: cloud.colors01,
+        opacities: cloud.opacities,
+        scales: cloud.scales,
+        quats: cloud.quats,
+    };
+    Ok(SavedGaussians { cloud, velocities: Vec::new(), motion_ids: Vec::new(), map_from_local })
 }
 
 /// Reads `map.ply`.

@@ -1,17 +1,18 @@
 //! `storm map`: what a saved map holds, and the map as PLY.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
 use super::Outcome;
 use crate::map::StaticMap;
 use crate::output::ply::{PlyCloud, write_ply};
+use crate::saved::{self, MapPlace};
 
 /// Arguments of `storm map`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Folder of a saved map: `map/` of a results folder, also of a run that was killed.
+    /// A results folder, its map/ (also of a run that was killed), or a PLY.
     map: PathBuf,
     /// Write the map in the 3DGS layout.
     #[arg(long)]
@@ -23,7 +24,13 @@ pub struct Args {
 
 /// Loads, checks, says, writes.
 pub fn run(args: &Args) -> Result<Outcome> {
-    let (map, problems) = StaticMap::open(&args.map, args.salvage)?;
+    let folder = match saved::find_map(&args.map, true) {
+        Some(MapPlace::Folder(folder)) => folder,
+        Some(MapPlace::Ply(ply)) => return of_ply(&ply, args.out.as_deref()),
+        // The error names what is missing.
+        None => args.map.clone(),
+    };
+    let (map, problems) = StaticMap::open(&folder, args.salvage)?;
     for problem in &problems {
         complain!("lost: {problem}");
     }
@@ -54,4 +61,15 @@ pub fn run(args: &Args) -> Result<Outcome> {
         write_ply(path, &ply, cloud.origin.to_array(), &notes)?;
     }
     Ok(if problems.is_empty() { Outcome::Done } else { Outcome::Lost })
+}
+
+/// The same of a PLY, which holds the Gaussians and nothing of tiles.
+fn of_ply(ply: &Path, out: Option<&Path>) -> Result<Outcome> {
+    let saved = saved::load_ply(ply)?;
+    let o = saved.map_from_local.translation;
+    say!("{} Gaussians in {}; origin {} {} {}", saved.cloud.len(), ply.display(), o.x, o.y, o.z);
+    if let Some(out) = out {
+        write_ply(out, &saved.cloud, o.to_array(), &["written from a PLY".to_string()])?;
+    }
+    Ok(Outcome::Done)
 }

@@ -10,12 +10,13 @@ use storm_render::{Intrinsics, Renderer, View};
 
 use super::{Outcome, UsageError};
 use crate::engine::select::MOVING_MPS;
+use crate::map::StaticMap;
 use crate::output::picture::{
     DepthScale, Picture, depth_picture, flow_picture, mask_overlay, with_depth_bar, with_flow_wheel,
 };
 use crate::output::tum::read_tum;
 use crate::rigid::Rigid;
-use crate::saved::{self, SavedGaussians, SavedObject};
+use crate::saved::{self, MapPlace, SavedGaussians, SavedObject};
 
 /// Coverage from which a pixel shows a surface.
 const SURFACE_ALPHA: f32 = 0.5;
@@ -25,7 +26,7 @@ const FULL_SPEED_MPS: f32 = 15.0;
 /// Arguments of `storm render`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// A map (map.ply), or a results folder: its map, or with --step one of its steps.
+    /// A results folder (its map, or with --step one of its steps), its map/, or a PLY.
     map: PathBuf,
     /// Camera pose in the map frame: X,Y,Z,YAW[,PITCH] (m, degrees; yaw 0 looks along x, pitch up is positive), or X,Y,Z,QW,QX,QY,QZ
     /// of a body with x forward, y left, z up.
@@ -144,11 +145,13 @@ pub fn run(args: &Args) -> Result<Outcome> {
             seen |= one(&(*pose * up), Some(*stamp_ns), &args.out.join(format!("{i:06}.png")))?;
         }
     }
-    let saved = &scene.still;
+    let at = scene.still.map_from_local.translation;
     if !seen {
         tracing::warn!(
-            "nothing is in view from there; the map's own position is {:?}",
-            saved.map_from_local.translation
+            "nothing is in view from there; the map's own position is {:.2} {:.2} {:.2} m",
+            at.x,
+            at.y,
+            at.z
         );
     }
     say!("{}", args.out.display());
@@ -177,10 +180,12 @@ impl Scenery {
                     let text = format!("--objects needs a results folder, {} is a file", args.map.display());
                     return Err(UsageError(text).into());
                 }
-                objects = saved::load_objects(&args.map)?;
+                // The objects lie beside the map's folder.
+                let folder = if StaticMap::is_saved_in(&args.map) { args.map.join("..") } else { args.map.clone() };
+                objects = saved::load_objects(&folder)?;
                 if args.pose.is_some() {
                     let at = args.at.ok_or_else(|| UsageError("--objects with --pose needs --at SECONDS".into()))?;
-                    let poses = read_tum(&args.map.join("trajectory.tum"))?;
+                    let poses = read_tum(&folder.join("trajectory.tum"))?;
                     let (first_ns, _) = poses.first().context("trajectory.tum holds no pose")?;
                     stamp_ns = first_ns.saturating_add(crate::sync::clock::signed_ns(at));
                 }
@@ -224,8 +229,14 @@ fn renderer(device: &str) -> Result<Box<dyn Renderer>> {
 
 fn load(path: &Path, step: Option<usize>) -> Result<SavedGaussians> {
     let is_ply = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply"));
+    if path.is_dir() && step.is_none() {
+        match saved::find_map(path, false) {
+            Some(MapPlace::Ply(ply)) => return saved::load_ply(&ply),
+            Some(MapPlace::Folder(folder)) => return saved::load_map(&folder),
+            None => {}
+        }
+    }
     match (path.is_dir(), is_ply, step) {
-        (true, _, None) if path.join("map.ply").exists() => saved::load_ply(&path.join("map.ply")),
         (true, _, step) => saved::load_step(&path.join("outputs.mcap"), step),
         (false, true, Some(_)) => bail!(UsageError("--step needs a results folder, not a .ply".into())),
         (false, true, None) => saved::load_ply(path),

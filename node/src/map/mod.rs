@@ -191,6 +191,11 @@ impl StaticMap {
         Self::load(&MapConfig { tile_m, voxel_m, max_written: 0, ..MapConfig::default() }, dir, salvage)
     }
 
+    /// True when a map is saved in the folder.
+    pub fn is_saved_in(dir: &Path) -> bool {
+        store::is_saved_in(dir)
+    }
+
     /// A copy of the map saved in `from`, kept in `dir` from now on; `from` is not changed.
     ///
     /// # Errors

@@ -192,6 +192,11 @@ impl Store {
     }
 }
 
+/// True when there is an index.
+pub(super) fn is_saved_in(dir: &Path) -> bool {
+    dir.join(INDEX_FILE).is_file()
+}
+
 /// Tile and voxel size of a saved map, metres.
 pub(super) fn sizes(dir: &Path) -> Result<(f64, f64), MapError> {
     let index = decode_index(&dir.join(INDEX_FILE))?;
