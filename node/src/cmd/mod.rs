@@ -59,7 +59,7 @@ pub struct UsageError(pub String);
 
 /// Streaming STORM: posed camera images in; 3D Gaussians, scene flow, motion masks, a map and trajectories out.
 #[derive(Debug, Parser)]
-#[command(name = "storm", version, arg_required_else_help = true)]
+#[command(name = "storm", version = env!("STORM_VERSION"), arg_required_else_help = true)]
 #[command(
     after_help = "Exit codes: 0 done; 1 bad usage or configuration; 2 input cannot be read; 3 finished, but something was lost.\n\
 Results go to stdout, logs to stderr. RUST_LOG=debug shows more."
