@@ -11,6 +11,7 @@ pub mod config;
 pub mod decode;
 pub mod dice;
 pub mod engine;
+pub mod error_line;
 pub mod extrinsics;
 pub mod gate;
 pub mod map;

@@ -25,6 +25,7 @@ use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
 use crate::config::ConfigError;
+use crate::error_line::error_line;
 use crate::source::RigError;
 
 /// How a command ended; the exit codes are part of the program's contract.
@@ -130,7 +131,7 @@ impl Cli {
             Command::Config(a) => config::run(&a),
         };
         result.unwrap_or_else(|e| {
-            complain!("error: {e:#}");
+            complain!("error: {}", error_line(&e));
             let of_masks = |c: &(dyn std::error::Error + 'static)| matches!(c.downcast_ref(), Some(RigError::Mask(_)));
             let usage = e.chain().any(|c| c.is::<ConfigError>() || c.is::<UsageError>() || of_masks(c));
             if usage { Outcome::Usage } else { Outcome::Input }

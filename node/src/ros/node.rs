@@ -26,6 +26,7 @@ use super::streams::{Arrivals, Stream, Use};
 use crate::cdr::encode_live::encode_diagnostics;
 use crate::config::Config;
 use crate::engine::ModelSource;
+use crate::error_line::error_line;
 use crate::output::qos::Qos;
 use crate::pipeline::live::{Change, Command, Inbox, Live, Message, Status, Watchdog};
 use crate::source::Rig;
@@ -280,7 +281,7 @@ impl Running {
             map: self.config.live.map != "never",
         };
         if let Err(e) = self.diagnostics.send(encode_diagnostics(now_ns, &report.statuses())) {
-            warn!("diagnostics could not be sent: {e:#}");
+            warn!("diagnostics could not be sent: {}", error_line(&e));
         }
     }
 }

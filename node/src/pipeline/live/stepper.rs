@@ -15,6 +15,7 @@ use super::skew::SkewGate;
 use super::status::Status;
 use super::worker::{Command, LOGGED, Message, Outlet, PATIENCE, lock};
 use crate::config::Config;
+use crate::error_line::error_line;
 use crate::pipeline::front::{Front, FrontOutput};
 use crate::pipeline::guard::{StagePanics, caught};
 use crate::pipeline::posed::PoseStore;
@@ -146,7 +147,7 @@ impl Stepper {
             Err(e) => {
                 self.own.failed_steps += 1;
                 if self.own.failed_steps <= LOGGED {
-                    warn!("step at {stamp_ns} ns failed: {e:#}");
+                    warn!("step at {stamp_ns} ns failed: {}", error_line(&e));
                 }
                 return Ok(None);
             }
@@ -166,7 +167,7 @@ impl Stepper {
     fn output(&mut self, what: &str, send: impl FnOnce(&mut Self) -> Result<()>) {
         match caught(|| send(self)) {
             Ok(Ok(())) => {}
-            Ok(Err(e)) => self.output_failed(&format!("{what}: {e:#}")),
+            Ok(Err(e)) => self.output_failed(&format!("{what}: {}", error_line(&e))),
             Err(said) => {
                 self.own.outlet_panics += 1;
                 self.output_failed(&format!("{what}: panicked: {said}"));
@@ -206,7 +207,7 @@ impl Stepper {
                         self.maker.set_map(map);
                         Ok(said)
                     }
-                    Err(e) => Err(format!("{e:#}")),
+                    Err(e) => Err(error_line(&e)),
                 })
             }
             Command::Cameras(active) => self.use_cameras(&active),

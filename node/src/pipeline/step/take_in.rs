@@ -10,6 +10,7 @@ use tracing::warn;
 
 use super::{Part, Ran, Step, StepMaker, newest_time_sec};
 use crate::engine::{select, views_of};
+use crate::error_line::error_line;
 use crate::gate::contract::Notch;
 use crate::gate::skipper::{Computed, Shadow};
 use crate::map::SceneLook;
@@ -40,7 +41,7 @@ impl StepMaker {
             Err(e) => match e.downcast_ref::<ModelError>() {
                 Some(ModelError::NonFinite { .. }) => {
                     self.non_finite += 1;
-                    warn!("window at {} ns dropped: {e:#}", window.stamp_ns);
+                    warn!("window at {} ns dropped: {}", window.stamp_ns, error_line(&e));
                     return Ok(None);
                 }
                 _ => return Err(e),
