@@ -15,6 +15,8 @@ const STEPS: u64 = (FRAMES - 15) as u64;
 
 struct Run {
     code: i32,
+    /// The exit code of `storm info`.
+    info: i32,
     stderr: String,
     out: PathBuf,
     _dir: tempfile::TempDir,
@@ -42,6 +44,10 @@ fn run(maker: Maker) -> Run {
 }
 
 fn run_bytes(maker: Maker, spoil: impl Fn(Vec<u8>) -> Vec<u8>) -> Run {
+    run_with(maker, spoil, &[])
+}
+
+fn run_with(maker: Maker, spoil: impl Fn(Vec<u8>) -> Vec<u8>, more: &[&str]) -> Run {
     let dir = tempfile::tempdir().unwrap();
     let (bag, out) = (dir.path().join("bag.mcap"), dir.path().join("out"));
     maker.write(&bag);
@@ -49,9 +55,15 @@ fn run_bytes(maker: Maker, spoil: impl Fn(Vec<u8>) -> Vec<u8>) -> Run {
     let log = std::process::Command::new(env!("CARGO_BIN_EXE_storm"))
         .args(["replay", bag.to_str().unwrap(), "--out", out.to_str().unwrap()])
         .args(["--set", "model.image_width=48", "--set", "model.image_height=32"])
+        .args(more)
         .output()
         .unwrap();
-    Run { code: code(&log), stderr: stderr(&log), out, _dir: dir }
+    let asked = std::process::Command::new(env!("CARGO_BIN_EXE_storm"))
+        .args(["info", bag.to_str().unwrap()])
+        .args(more)
+        .output()
+        .unwrap();
+    Run { code: code(&log), info: code(&asked), stderr: stderr(&log), out, _dir: dir }
 }
 
 #[test]
@@ -60,6 +72,79 @@ fn an_unspoiled_bag_loses_nothing() {
     assert_eq!(r.code, 0, "{}", r.stderr);
     assert!(r.metric("steps") >= STEPS);
     assert_eq!(r.metric("images_in"), 2 * FRAMES as u64);
+    assert_eq!(r.info, 0);
+}
+
+#[test]
+fn images_of_another_size_than_their_camera_info_are_refused_once_with_both_sizes() {
+    let info = |_: usize, k: &mut storm_node::msg::CameraInfo| {
+        (k.width, k.height) = (640, 480);
+        true
+    };
+    let r = run(Maker { info: Box::new(info), ..Maker::default() });
+    assert_eq!((r.code, r.info), (2, 2), "{}", r.stderr);
+    r.says(&["64x48", "640x480", "/camera0/image"]);
+    assert!(!r.stderr.contains("QoS"), "{}", r.stderr);
+    assert_eq!(r.stderr.matches("640x480").count(), 1, "{}", r.stderr);
+}
+
+#[test]
+fn stamps_that_were_never_filled_in_are_refused_with_the_key_that_helps() {
+    let maker = || {
+        let image = |_: usize, m: &mut storm_node::msg::Image| {
+            m.header.stamp_ns = 0;
+            true
+        };
+        Maker { image: Box::new(image), ..Maker::default() }
+    };
+    let r = run(maker());
+    assert_eq!((r.code, r.info), (2, 2), "{}", r.stderr);
+    r.says(&["/camera0/image", "stamps are 0 s", "input.stamps=recorded"]);
+    let r = run_with(maker(), |b| b, &["--set", "input.stamps=recorded"]);
+    assert_eq!((r.code, r.info), (0, 0), "{}", r.stderr);
+    assert!(r.metric("steps") >= STEPS);
+}
+
+#[test]
+fn images_and_poses_of_two_clocks_are_refused_with_the_distance() {
+    let pose = |_: usize, p: &mut storm_node::msg::PoseStamped| {
+        p.header.stamp_ns -= 1_699_999_000 * 1_000_000_000;
+        true
+    };
+    let r = run(Maker { pose: Box::new(pose), ..Maker::default() });
+    assert_eq!((r.code, r.info), (2, 2), "{}", r.stderr);
+    r.says(&["1,699,999,000 s later than poses", "two clocks", "input.image_time_offset_sec"]);
+}
+
+#[test]
+fn a_recording_too_short_for_a_window_says_what_one_needs() {
+    let r = run_with(Maker::default(), |b| b, &["--set", "window.stride_sec=5"]);
+    assert_eq!((r.code, r.info), (3, 3), "{}", r.stderr);
+    r.says(&["no step was run", "4 timesteps 5 s apart", "window.stride_sec"]);
+}
+
+#[test]
+fn a_camera_at_half_the_rate_loses_nothing() {
+    let r = run(Maker { image: Box::new(|i, _| i < 1000 || i % 2 == 0), ..Maker::default() });
+    assert_eq!((r.code, r.info), (0, 0), "{}", r.stderr);
+    assert_eq!((r.dropped("surplus"), r.dropped("incomplete")), (10, 0));
+}
+
+#[test]
+fn results_of_another_recording_are_kept_unless_asked() {
+    let dir = tempfile::tempdir().unwrap();
+    let (a, b, out) = (dir.path().join("a.mcap"), dir.path().join("b.mcap"), dir.path().join("out"));
+    for bag in [&a, &b] {
+        Maker::default().write(bag);
+    }
+    assert_eq!(code(&replay(&a, &out, &[])), 0);
+    assert_eq!(code(&replay(&a, &out, &[])), 0, "the same recording again");
+    let refused = replay(&b, &out, &[]);
+    assert_eq!(code(&refused), 1, "{}", stderr(&refused));
+    assert!(stderr(&refused).contains("a.mcap") && stderr(&refused).contains("--overwrite"), "{}", stderr(&refused));
+    assert!(metrics(&out)["recording"].as_str().unwrap().ends_with("/a.mcap"));
+    assert_eq!(code(&replay(&b, &out, &["--overwrite"])), 0);
+    assert!(metrics(&out)["recording"].as_str().unwrap().ends_with("/b.mcap"));
 }
 
 #[test]
@@ -75,6 +160,7 @@ fn poses_from_tf_give_the_same_map_as_poses_from_a_topic() {
 fn a_missing_camera_info_is_named() {
     let r = run(Maker { info: Box::new(|camera, _| camera != 1), ..Maker::default() });
     assert_eq!(r.code, 2, "{}", r.stderr);
+    assert_eq!(r.info, 2);
     r.says(&["/camera1/camera_info", "intrinsics"]);
 }
 
@@ -101,6 +187,7 @@ fn missing_poses_are_named() {
 fn a_missing_mounting_is_named_with_the_fix() {
     let r = run(Maker { mount: Box::new(|camera, _| camera != 1), ..Maker::default() });
     assert_eq!(r.code, 2, "{}", r.stderr);
+    assert_eq!(r.info, 2);
     r.says(&["camera1_optical", "base_link", "input.base_from_camera"]);
 }
 

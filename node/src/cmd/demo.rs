@@ -24,6 +24,16 @@ pub struct Args {
 /// Makes the drive below the results folder and replays it.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let config = args.common.config()?;
+    let needed_sec = config.window.span_sec();
+    if args.seconds < needed_sec {
+        let (timesteps, stride_sec) = (config.window.timesteps, config.window.stride_sec);
+        let text = format!(
+            "--seconds {}: a window needs {timesteps} timesteps {stride_sec} s apart, {needed_sec} s in all (window.timesteps, \
+             window.stride_sec)",
+            args.seconds
+        );
+        return Err(UsageError(text).into());
+    }
     let out = args.common.out.clone().unwrap_or_else(|| "storm_out/demo".into());
     let options = DriveOptions { seed: args.seed, seconds: args.seconds, ..DriveOptions::default() };
     let drive = Drive::new(&options).map_err(|e| UsageError(e.to_string()))?;
@@ -36,5 +46,5 @@ pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
         bar.set_position(done);
     })?;
     bar.finish_and_clear();
-    run_into(&bag, &out, config, 1, progress)
+    run_into(&bag, &out, &args.common, 1, progress)
 }

@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use tracing::warn;
 
 use super::{Outcome, UsageError, progress_bar};
 use crate::config::Config;
-use crate::pipeline::replay::{self, ReplayOptions, default_out};
+use crate::pipeline::replay::{self, ReplayOptions, default_out, recording_name};
 
 /// Arguments of `storm replay`.
 #[derive(Debug, clap::Args)]
@@ -26,6 +27,16 @@ pub struct Common {
     /// Results folder [default: storm_out/<bag>].
     #[arg(long)]
     pub out: Option<PathBuf>,
+    /// Replace the results of another recording that are in the results folder (those of the same one are replaced in any case).
+    #[arg(long)]
+    pub overwrite: bool,
+    #[command(flatten)]
+    overrides: Overrides,
+}
+
+/// What the configuration is made from.
+#[derive(Debug, clap::Args)]
+pub struct Overrides {
     /// Configuration file (YAML, plain or ROS 2 parameters).
     #[arg(long)]
     pub config: Option<PathBuf>,
@@ -43,6 +54,13 @@ pub struct Common {
 impl Common {
     /// The configuration: file, then overrides, then flags.
     pub fn config(&self) -> Result<Config> {
+        self.overrides.config()
+    }
+}
+
+impl Overrides {
+    /// The configuration: file, then overrides, then flags.
+    pub fn config(&self) -> Result<Config> {
         let mut config = Config::from_arguments(self.config.as_deref(), &self.set)?;
         if let Some(weights) = &self.weights {
             config.model.weights = weights.display().to_string();
@@ -58,14 +76,16 @@ impl Common {
 /// Replays the bag.
 pub fn run(args: &Args, progress: bool) -> Result<Outcome> {
     let out = args.common.out.clone().unwrap_or_else(|| default_out(&args.bag));
-    run_into(&args.bag, &out, args.common.config()?, usize::from(args.batch), progress)
+    run_into(&args.bag, &out, &args.common, usize::from(args.batch), progress)
 }
 
 /// Replays `bag` into `out`, `batch` windows at a time, and prints what came of it.
-pub(super) fn run_into(bag: &Path, out: &Path, config: Config, batch: usize, progress: bool) -> Result<Outcome> {
+pub(super) fn run_into(bag: &Path, out: &Path, common: &Common, batch: usize, progress: bool) -> Result<Outcome> {
+    let config = common.config()?;
     if out.exists() && !out.is_dir() {
         return Err(UsageError(format!("--out {} is a file; give a folder", out.display())).into());
     }
+    check_earlier_results(bag, out, common.overwrite)?;
     if config.model.threads > 0 {
         // Fails only when a pool was set up before in this process; then that one is kept.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.model.threads).build_global();
@@ -79,7 +99,11 @@ pub(super) fn run_into(bag: &Path, out: &Path, config: Config, batch: usize, pro
     });
     bar.finish_and_clear();
     let metrics = metrics?;
-    say!("{}", out.join("report.html").display());
+    let report = out.join("report.html");
+    match report.exists() {
+        true => say!("{}", report.display()),
+        false => say!("{} (no report.html)", out.display()),
+    }
     say!(
         "{} frames, {} steps, {} map Gaussians, {} trajectories; weights: {}",
         metrics.frames_in,
@@ -91,9 +115,30 @@ pub(super) fn run_into(bag: &Path, out: &Path, config: Config, batch: usize, pro
     if let Some(s) = &metrics.held_out {
         say!("{}", s.line());
     }
+    let left_out = metrics.left_out_line();
+    if !left_out.is_empty() {
+        say!("not used: {left_out}");
+    }
+    if let Some(verdict) = &metrics.verdict {
+        complain!("{verdict}");
+    }
     if metrics.lost() {
         complain!("lost: {}", metrics.loss_line());
         return Ok(Outcome::Lost);
     }
     Ok(Outcome::Done)
+}
+
+/// Refuses a folder with the results of another recording, and says that those of the same one are replaced.
+fn check_earlier_results(bag: &Path, out: &Path, overwrite: bool) -> Result<()> {
+    let Ok(text) = std::fs::read_to_string(out.join("metrics.json")) else { return Ok(()) };
+    let earlier: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
+    let earlier = earlier["recording"].as_str().unwrap_or("an unknown recording");
+    if earlier == recording_name(bag) || overwrite {
+        warn!("{} holds results of {earlier}; they are replaced", out.display());
+        return Ok(());
+    }
+    let text =
+        format!("{} holds results of {earlier}: give another --out, or --overwrite to replace them", out.display());
+    Err(UsageError(text).into())
 }

@@ -36,6 +36,8 @@ section! {
         base_from_camera: Vec<[f64; 7]> = Vec::new(),
         /// Camera the window is anchored at; -1: the one that looks most nearly along the vehicle's x axis.
         reference_camera: i64 = -1,
+        /// Which stamps count: `header` (the messages' own), `recorded` (when the recording got each message; live, when it came in), for headers that are not filled in or of two clocks.
+        stamps: String = "header".into(),
         /// Constant added to each camera's stamps, seconds; empty: none.
         image_time_offset_sec: Vec<f64> = Vec::new(),
         /// Whether images are rectified already: `auto` (the last part of the topic's name says so, else the CameraInfo), `true`, `false`; or a list with one of them per camera.
@@ -58,7 +60,7 @@ section! {
         timeout_sec: f64 = 0.25,
         /// How long a set waits for a pose after its newest image, seconds of message time.
         pose_wait_sec: f64 = 0.5,
-        /// Largest gap between two poses that is still interpolated across, seconds.
+        /// Largest gap between two poses that is still interpolated across, seconds; poses that come slower are followed up to 2 s.
         pose_gap_sec: f64 = 0.5,
         /// Most images of one camera that wait for the others; the oldest is dropped beyond it.
         max_pending: usize = 64,
@@ -308,6 +310,13 @@ section! {
         map_every_sec: f64 = 1.0,
         /// Most in one message of the map, MiB: the whole map is thinned out evenly, changed tiles wait for the next message.
         map_max_mb: f64 = 8.0,
+    }
+}
+
+impl WindowConfig {
+    /// Time from the first timestep of a window to the last, seconds.
+    pub fn span_sec(&self) -> f64 {
+        self.stride_sec * self.timesteps.saturating_sub(1) as f64
     }
 }
 

@@ -1,6 +1,6 @@
 //! From events to windows: synchronise, pose, window. Plain values in, plain values out; message time is the only clock.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use tracing::warn;
@@ -11,12 +11,15 @@ use crate::rigid::Rigid;
 use crate::source::Rig;
 use crate::source::event::{Event, Frame, Truth};
 use crate::source::topics::TruthKind;
-use crate::sync::clock::unsigned_ns;
+use crate::sync::clock::{seconds_between, unsigned_ns};
 use crate::sync::{DropCounts, DropReason, Synchronizer};
 use crate::window::{PosedSet, Window, WindowBuilder, WindowCounts};
 
 use super::guard::caught;
 use super::posed::{PoseStage, PoseStore};
+
+/// So long after the first image the program says where most images go, seconds of message time.
+const EARLY_VERDICT_SEC: f64 = 5.0;
 
 /// One ground-truth image with its size.
 #[derive(Debug, Clone)]
@@ -71,10 +74,18 @@ pub struct Front {
     /// Images in sets that were handed on.
     used: u64,
     panics: u64,
+    /// Poses come ahead of the images they are for, so that images alone say what time it is.
+    poses_ahead: bool,
+    /// By reason, what the newest message lost before synchronisation said.
+    lost_detail: BTreeMap<DropReason, String>,
+    /// Stamp of the first image; none once the early verdict was given.
+    watched_since_ns: Option<i64>,
+    early_verdict: bool,
 }
 
 impl Front {
-    /// For the cameras of `rig` and poses from `store`; a window for every set that ends one.
+    /// For the cameras of `rig` and poses from `store`; a window for every set that ends one. For recordings: poses come before
+    /// the images they are for (as [`crate::source::bag::BagSource::events`] gives them), so images alone say what time it is.
     pub fn new(config: &Config, rig: &Rig, store: PoseStore) -> Self {
         Self {
             sync: Synchronizer::new(rig.cameras.len(), &config.sync, &config.input.image_time_offset_sec),
@@ -93,12 +104,16 @@ impl Front {
             superseded: 0,
             used: 0,
             panics: 0,
+            poses_ahead: true,
+            lost_detail: BTreeMap::new(),
+            watched_since_ns: None,
+            early_verdict: false,
         }
     }
 
     /// The same, but windows are given only when [`Front::newest_window`] asks: what cannot keep up takes the newest.
     pub fn on_demand(config: &Config, rig: &Rig, store: PoseStore) -> Self {
-        Self { each_set: false, ..Self::new(config, rig, store) }
+        Self { each_set: false, poses_ahead: false, ..Self::new(config, rig, store) }
     }
 
     /// Goes on with `active` cameras of the rig alone, in rising order. When all of them were there before, windows go on
@@ -161,6 +176,7 @@ impl Front {
         match event {
             Event::Image { camera, stamp_ns, frame } => match self.active.iter().position(|&c| c == camera) {
                 Some(camera) => {
+                    self.watched_since_ns.get_or_insert(stamp_ns);
                     self.sync.push(camera, stamp_ns, frame);
                     if self.sync.epoch() == self.epoch {
                         self.heard(stamp_ns);
@@ -171,24 +187,30 @@ impl Front {
                 }
                 None => self.lost.add(DropReason::Incomplete, 1),
             },
-            Event::Pose { stamp_ns, map_from_base } => {
-                self.heard(stamp_ns);
-                self.posed.push_pose(stamp_ns, map_from_base);
+            Event::Pose { stamp_ns, .. } => {
+                self.heard_pose(stamp_ns);
+                self.posed.take_pose(&event);
             }
-            Event::Transform(t) => {
-                self.heard(t.header.stamp_ns);
-                self.posed.push_transform(&t, false);
+            Event::Transform(ref t) => {
+                self.heard_pose(t.header.stamp_ns);
+                self.posed.take_pose(&event);
             }
-            Event::StaticTransform(t) => self.posed.push_transform(&t, true),
+            Event::StaticTransform(_) => self.posed.take_pose(&event),
             Event::Truth { camera, stamp_ns, kind, width, height, data } => {
                 let image = TruthImage { width, height, data };
                 out.push_back(FrontOutput::Truth { camera, stamp_ns, kind, image });
                 return;
             }
-            Event::Lost { camera, reason, .. } => {
+            Event::Lost { camera, reason, detail } => {
                 // Only images are counted by reason: what came in is then what was used plus what was dropped.
                 match camera {
-                    Some(_) => self.lost.add(reason, 1),
+                    Some(camera) => {
+                        self.lost.add(reason, 1);
+                        self.lost_detail.insert(reason, detail);
+                        if let Some(place) = self.active.iter().position(|&c| c == camera) {
+                            self.sync.unreadable(place);
+                        }
+                    }
                     None => self.messages_lost += 1,
                 }
             }
@@ -198,6 +220,61 @@ impl Front {
             self.report_starvation(now_ns);
         }
         self.drain(out);
+        self.judge_early();
+    }
+
+    fn heard_pose(&mut self, stamp_ns: i64) {
+        if !self.poses_ahead {
+            self.heard(stamp_ns);
+        }
+    }
+
+    /// Says after the first seconds where most images go, so that nobody waits for the end of a run that gives nothing.
+    fn judge_early(&mut self) {
+        let (Some(since_ns), Some(now_ns), false) = (self.watched_since_ns, self.now_ns, self.early_verdict) else {
+            return;
+        };
+        if seconds_between(since_ns, now_ns).abs() >= EARLY_VERDICT_SEC {
+            self.early_verdict = true;
+            if let Some(verdict) = self.verdict() {
+                warn!("{verdict}");
+            }
+        }
+    }
+
+    /// When more than half of the images went one way: which, and in one sentence why, with the key that may change it.
+    pub fn verdict(&self) -> Option<String> {
+        let (all, drops) = (self.images_in(), self.drops());
+        let (reason, n) = drops.iter().find(|(_, n)| n.saturating_mul(2) > all)?;
+        Some(format!("{n} of {all} images were dropped ({reason}): {}", self.why(reason)))
+    }
+
+    fn why(&self, reason: DropReason) -> String {
+        if let Some(detail) = self.lost_detail.get(&reason) {
+            return format!("the last one was {detail}");
+        }
+        match reason {
+            DropReason::NoPose | DropReason::PoseGap => {
+                self.posed.why(reason).unwrap_or_else(|| "no pose came: check the pose topic (input.pose)".into())
+            }
+            DropReason::Incomplete | DropReason::Surplus => self.sync.why_incomplete(&self.names),
+            DropReason::Edge => {
+                "they lie before the first pose or after the last one: the recording is too short".into()
+            }
+            DropReason::Late => {
+                "they are recorded after images that are newer by more than sync.slop_sec: raise it".into()
+            }
+            DropReason::Duplicate => {
+                "each stamp came twice: the images are in the recording doubly, nothing is lost".into()
+            }
+            DropReason::ClockJump => {
+                "their stamps jump back and forth: sync.jump_back_sec and sync.jump_forward_sec say what is a jump"
+                    .into()
+            }
+            DropReason::NoCalibration => "their camera has no intrinsics or no mounting".into(),
+            DropReason::Overflow => "they wait too long for other cameras or poses: see sync.max_pending".into(),
+            DropReason::Decode | DropReason::Panic => "they cannot be read".into(),
+        }
     }
 
     /// A message with this stamp came in. A stamp far ahead moves the time on only when it is an image's and the next one

@@ -33,6 +33,8 @@ pub struct Counts {
     pub stage_panics: u64,
     /// What could not be read.
     pub problems: Vec<String>,
+    /// Where more than half of the images went and why, if they went one way.
+    pub verdict: Option<String>,
 }
 
 impl Counts {
@@ -48,6 +50,7 @@ impl Counts {
             non_finite_windows: finished.non_finite_windows,
             stage_panics: finished.panics + front.panics(),
             problems,
+            verdict: front.verdict(),
         }
     }
 }
@@ -55,6 +58,8 @@ impl Counts {
 /// The content of `metrics.json`.
 #[derive(Debug, Clone, Serialize)]
 pub struct Metrics {
+    /// The recording's file or folder name.
+    pub recording: String,
     /// The weights file's name, or `untrained`.
     pub weights: String,
     /// The network.
@@ -129,6 +134,12 @@ pub struct Metrics {
     pub origin_m: [f64; 3],
     /// Times the clock jumped or the recording looped.
     pub epochs: u32,
+    /// Where more than half of the images went and why, if they went one way.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<String>,
+    /// Why no step was run, if none was.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub no_steps: Option<String>,
     /// Error figures on frames that were not context, where there were any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub held_out: Option<Scores>,
@@ -137,8 +148,7 @@ pub struct Metrics {
 impl Metrics {
     /// True when something of the input was lost.
     pub fn lost(&self) -> bool {
-        let dropped: u64 = self.dropped.values().sum();
-        dropped
+        self.dropped_lost()
             + self.messages_lost
             + self.nonfinite
             + self.poses_rejected
@@ -151,12 +161,26 @@ impl Metrics {
             + self.map.tiles_lost
             > 0
             || !self.problems.is_empty()
+            || self.no_steps.is_some()
+    }
+
+    /// Images dropped that something could have been made of.
+    fn dropped_lost(&self) -> u64 {
+        DropReason::ALL.iter().filter(|r| r.is_loss()).filter_map(|r| self.dropped.get(r.as_str())).sum()
+    }
+
+    /// One line of images nothing could have been made of, by reason; empty when there were none.
+    pub fn left_out_line(&self) -> String {
+        let count = |r: &DropReason| Some((self.dropped.get(r.as_str()).copied().filter(|&n| n > 0)?, *r));
+        let left_out = DropReason::ALL.iter().filter(|r| !r.is_loss()).filter_map(count);
+        left_out.map(|(n, reason)| format!("{n} images {reason}")).collect::<Vec<_>>().join(", ")
     }
 
     /// One line of what was lost, empty when nothing was.
     pub fn loss_line(&self) -> String {
-        let mut parts: Vec<String> =
-            self.dropped.iter().filter(|(_, n)| **n > 0).map(|(r, n)| format!("{n} images {r}")).collect();
+        let dropped = |r: &DropReason| Some((*r, self.dropped.get(r.as_str()).copied().filter(|&n| n > 0)?));
+        let lost = DropReason::ALL.iter().filter(|r| r.is_loss()).filter_map(dropped);
+        let mut parts: Vec<String> = lost.map(|(reason, n)| format!("{n} images {reason}")).collect();
         for (n, what) in [
             (self.messages_lost, "messages unreadable"),
             (self.nonfinite, "non-finite values published"),
@@ -173,6 +197,7 @@ impl Metrics {
                 parts.push(format!("{n} {what}"));
             }
         }
+        parts.extend(self.no_steps.iter().cloned());
         parts.extend(self.problems.iter().cloned());
         parts.join("; ")
     }

@@ -2,7 +2,7 @@
 //! bounded channels that block, so nothing is dropped and the order of results is the order of the recording.
 
 use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -57,6 +57,7 @@ pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
     let model = ModelSource::open(&config.model)?;
     let size = model.picture_size(&config.model)?;
     let source = BagSource::open(&options.bag, config, size)?;
+    source.check().with_context(|| format!("bag {}", options.bag.display()))?;
     let rig = source.rig();
     let engine =
         Engine::new(model, &config.model, rig.cameras.len(), config.window.timespan_sec)?.with_skips(&config.skip);
@@ -68,7 +69,8 @@ pub fn run(options: &ReplayOptions, progress: Progress) -> Result<Metrics> {
     describe(&source, &rig, &engine, size);
     std::fs::create_dir_all(&options.out)
         .with_context(|| format!("cannot make results folder {}", options.out.display()))?;
-    let title = options.bag.file_name().map_or_else(|| "bag".into(), |n| n.to_string_lossy());
+    let title = recording_name(&options.bag);
+    remove_earlier(&options.out)?;
     let sink = Sink::create(&title, &options.out, &rig, &engine, config)?;
     let weights = engine.weights().to_string();
     let preset = engine.model_config().describe();
@@ -229,6 +231,28 @@ fn write(mut sink: Sink, inputs: &Receiver<SinkInput>) -> Result<Sink> {
         sink.take(input)?;
     }
     Ok(sink)
+}
+
+/// What results call a recording: its file or folder, and the folder that is in (many bags are called `bag`).
+pub fn recording_name(bag: &Path) -> String {
+    let names = bag.components().rev().filter(|c| matches!(c, Component::Normal(_)));
+    let mut parts: Vec<_> = names.take(2).map(|c| c.as_os_str().to_string_lossy()).collect();
+    parts.reverse();
+    parts.join("/")
+}
+
+/// Removes what says what a run came to, so that nothing of an earlier one is taken for this one's. The other files are
+/// replaced as they are written.
+fn remove_earlier(out: &Path) -> Result<()> {
+    for name in ["metrics.json", "report.html"] {
+        match std::fs::remove_file(out.join(name)) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                return Err(e).with_context(|| format!("cannot replace {}", out.join(name).display()));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
 }
 
 /// Where results go when nobody says: `storm_out/<name of the bag>`.

@@ -5,8 +5,8 @@ mod gate;
 mod timeline;
 
 pub use check::{MAX_POSITION_M, PoseCounts, PoseNote, PoseReject, REFUSE_QUAT_TOLERANCE, checked};
-pub use gate::PoseGate;
-pub(crate) use timeline::Timeline;
+pub use gate::{PoseGate, PoseTiming};
+pub(crate) use timeline::{MAX_FOLLOWED_GAP_SEC, Timeline, usual_interval_ns};
 pub use timeline::{PoseLookup, PoseMissing};
 
 use crate::config::SyncConfig;
@@ -40,6 +40,11 @@ impl PoseBuffer {
     /// The pose at a stamp: position linear, rotation spherical, between the two poses around it, in f64.
     pub fn lookup(&self, stamp_ns: i64) -> PoseLookup {
         self.timeline.lookup(stamp_ns)
+    }
+
+    /// When the newest pose came and how often they come.
+    pub fn timing(&self) -> PoseTiming {
+        PoseTiming { latest_ns: self.timeline.latest_ns(), interval_sec: self.timeline.usual_interval_sec() }
     }
 
     /// The newest pose's stamp.

@@ -32,6 +32,16 @@ pub enum PoseLookup {
     Never(PoseMissing),
 }
 
+/// The widest gap that is interpolated across because the samples themselves come no faster, seconds. At 15 m/s a curve of 50 m
+/// radius is 0.6 m from its chord by then; a larger gap has to be asked for with `sync.pose_gap_sec`.
+pub(crate) const MAX_FOLLOWED_GAP_SEC: f64 = 2.0;
+
+/// Intervals on each side of a gap that tell how often samples come.
+const RATE_INTERVALS: usize = 8;
+
+/// A gap may be this many times the usual interval and still be the samples' own rate.
+const RATE_SLACK: f64 = 1.5;
+
 /// Samples of one transform, sorted by stamp.
 #[derive(Debug)]
 pub(crate) struct Timeline {
@@ -98,11 +108,26 @@ impl Timeline {
             return PoseLookup::Never(PoseMissing::BeforeFirst { first_ns: after_ns });
         };
         let gap_ns = after_ns.abs_diff(before_ns);
-        if gap_ns > self.gap_ns {
+        if gap_ns > self.gap_ns && gap_ns > self.followed_ns(at) {
             return PoseLookup::Never(PoseMissing::GapTooWide { gap_sec: seconds_between(before_ns, after_ns) });
         }
         let alpha = stamp_ns.abs_diff(before_ns) as f64 / gap_ns as f64;
         PoseLookup::At(before.interpolate(&after, alpha))
+    }
+
+    /// The gap allowed by how often samples come around sample `at`: no more than [`MAX_FOLLOWED_GAP_SEC`].
+    fn followed_ns(&self, at: usize) -> u64 {
+        let from = at.saturating_sub(RATE_INTERVALS + 1);
+        let to = at.saturating_add(RATE_INTERVALS + 1).min(self.samples.len());
+        let usual_ns = usual_interval_ns(self.samples.range(from..to).map(|(s, _)| *s)).unwrap_or(0);
+        let allowed_ns = (usual_ns as f64 * RATE_SLACK) as u64;
+        allowed_ns.min(unsigned_ns(MAX_FOLLOWED_GAP_SEC))
+    }
+
+    /// How often the newest samples come, seconds; none with fewer than two.
+    pub fn usual_interval_sec(&self) -> Option<f64> {
+        let from = self.samples.len().saturating_sub(2 * RATE_INTERVALS + 1);
+        Some(usual_interval_ns(self.samples.range(from..).map(|(s, _)| *s))? as f64 * 1e-9)
     }
 
     /// The newest sample's stamp.
@@ -131,4 +156,13 @@ impl Timeline {
         self.samples.clear();
         self.clock.reset();
     }
+}
+
+/// The median of the intervals between rising stamps (of an even number the smaller middle one); none with fewer than two.
+pub(crate) fn usual_interval_ns(stamps_ns: impl Iterator<Item = i64>) -> Option<u64> {
+    let mut before_ns = None;
+    let mut intervals: Vec<u64> =
+        stamps_ns.filter_map(|ns| before_ns.replace(ns).map(|earlier: i64| ns.abs_diff(earlier))).collect();
+    let middle = intervals.len().checked_sub(1)? / 2;
+    Some(*intervals.select_nth_unstable(middle).1)
 }

@@ -1,27 +1,35 @@
 //! A recorded bag as a stream of events.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use tracing::{info, warn};
 
-use crate::bag::Bag;
+use crate::bag::{Bag, BagError, RawMessage};
 use crate::cdr::decode as cdr;
 use crate::config::{Config, InputConfig, SyncConfig};
+use crate::decode::RgbPicture;
 use crate::msg::{CameraInfo, PoseStamped, TransformStamped};
+use crate::pipeline::posed::PoseStore;
 use crate::sync::DropReason;
-use crate::sync::clock::seconds_between;
+use crate::sync::clock::{seconds_between, signed_ns};
 use crate::tf::TfTree;
 
-use super::event::Event;
+use super::ahead::PoseAhead;
+use super::event::{Event, Frame};
 use super::first::FirstPictures;
 use super::first_images::black_frames;
 use super::frames::{Frames, MAP_FRAME_AHEAD_SEC};
 use super::mount::PoseNames;
 use super::rig::{CameraDescription, Rig};
+use super::survey::Survey;
 use super::topics::{COMPRESSED, PoseTopic, TopicError, TopicPlan};
 use super::translate::{Role, translate};
+
+/// Images of a camera that may be unreadable before it is given up.
+const IMAGES_TRIED: usize = 5;
 
 /// Losses of one topic that are written to the log one by one; the rest is only counted.
 const LOGGED_LOSSES_PER_TOPIC: usize = 5;
@@ -31,7 +39,8 @@ pub struct BagSource {
     bag: Bag,
     plan: TopicPlan,
     rig: Arc<Rig>,
-    sync: SyncConfig,
+    config: Config,
+    survey: Survey,
     static_transforms: Vec<TransformStamped>,
     roles: Vec<Role>,
 }
@@ -75,7 +84,46 @@ impl BagSource {
         if plan.pose == PoseTopic::Tf || rig.needs_tree() {
             plan.tf.iter().for_each(|&t| roles[t] = Role::Transform);
         }
-        Ok(Self { bag, plan, rig: Arc::new(rig), sync: config.sync.clone(), static_transforms, roles })
+        let survey = Survey::beginning(&bag, &plan).with_context(|| format!("bag {}", path.display()))?;
+        let (rig, config) = (Arc::new(rig), config.clone());
+        Ok(Self { bag, plan, rig, config, survey, static_transforms, roles })
+    }
+
+    /// Refuses a recording no step can come of: stamps of two clocks, images none of which can be read. The error says why and what
+    /// to set.
+    pub fn check(&self) -> Result<()> {
+        let recorded_sec = match (self.bag.start_ns(), self.bag.end_ns()) {
+            (Some(start_ns), Some(end_ns)) => seconds_between(start_ns, end_ns),
+            _ => 0.0,
+        };
+        self.survey.check(&self.plan, &self.config.input, recorded_sec)?;
+        self.check_images()
+    }
+
+    /// Reads the first images of every camera, as a replay does, until one fits its CameraInfo.
+    fn check_images(&self) -> Result<()> {
+        for (camera, c) in self.plan.cameras.iter().enumerate() {
+            let mut first_error = None;
+            for message in self.bag.messages(&[c.image])?.flatten().take(IMAGES_TRIED) {
+                let mut why = None;
+                self.translate(&message, &mut |event| {
+                    if let Event::Lost { detail, .. } = event {
+                        why = Some(detail);
+                    }
+                });
+                match why {
+                    Some(why) => first_error = first_error.or(Some(why)),
+                    None => {
+                        first_error = None;
+                        break;
+                    }
+                }
+            }
+            if let Some(why) = first_error {
+                bail!("camera {camera}: none of its first images can be read; {why}");
+            }
+        }
+        Ok(())
     }
 
     /// The cameras.
@@ -90,7 +138,7 @@ impl BagSource {
 
     /// The static transforms, for a pose that comes from TF.
     pub fn statics(&self) -> TfTree {
-        static_tree(&self.sync, &self.static_transforms)
+        static_tree(&self.config.sync, &self.static_transforms)
     }
 
     /// Where the pose comes from and between which frames, for people.
@@ -121,39 +169,120 @@ impl BagSource {
         self.bag.problems()
     }
 
-    /// Runs through the bag once, in log-time order. `each` returns false to stop early.
-    pub fn events(&self, mut each: impl FnMut(Event) -> bool) -> Result<()> {
-        let wanted: Vec<usize> = (0..self.roles.len()).filter(|&i| !matches!(self.roles[i], Role::None)).collect();
+    /// Runs through the bag once: images and ground truth in log-time order, every image behind the poses it needs, wherever
+    /// these are recorded. `each` returns false to stop early.
+    pub fn events(&self, each: impl FnMut(Event) -> bool) -> Result<()> {
+        self.run(true, each)
+    }
+
+    /// The same without pixels: images are empty, and there is no ground truth. For what stamps alone say.
+    pub fn events_without_pixels(&self, each: impl FnMut(Event) -> bool) -> Result<()> {
+        self.run(false, each)
+    }
+
+    fn run(&self, pixels: bool, mut each: impl FnMut(Event) -> bool) -> Result<()> {
+        let mut poses = self.plan.pose_topics();
+        if self.rig.needs_tree() {
+            // Joints of cameras, and the frame that poses are given in, are needed as early as the poses.
+            poses.extend(self.plan.tf.iter().copied());
+            poses.sort_unstable();
+            poses.dedup();
+        }
+        let wanted = |role: &Role| match role {
+            Role::None => false,
+            Role::Truth { .. } => pixels,
+            _ => true,
+        };
+        let others = (0..self.roles.len()).filter(|i| wanted(&self.roles[*i]) && !poses.contains(i));
+        let others: Vec<usize> = others.collect();
         let mut losses = vec![0usize; self.roles.len()];
-        for message in self.bag.messages(&wanted)? {
+        let mut hand_on = |topic: Option<usize>, event: Event| {
+            if let (Event::Lost { detail, .. }, Some(topic)) = (&event, topic) {
+                losses[topic] += 1;
+                if losses[topic] <= LOGGED_LOSSES_PER_TOPIC {
+                    warn!("{detail}");
+                }
+            }
+            each(event)
+        };
+        let translated = |message: &RawMessage| {
+            let mut events = Vec::new();
+            self.translate(message, &mut |event| events.push(event));
+            events
+        };
+        let store = PoseStore::of_bag(self, &self.rig, &self.config);
+        let dated_ahead_ns = if self.rig.stamps_recorded { BTreeMap::new() } else { self.survey.dated_ahead() };
+        let mut ahead =
+            PoseAhead::new(self.bag.messages(&poses)?, translated, store, dated_ahead_ns, &self.config.sync);
+        for message in self.bag.messages(&others)? {
             let message = match message {
                 Ok(m) => m,
                 Err(e) => {
-                    warn!("{e}");
-                    if !each(Event::Lost { camera: None, reason: DropReason::Decode, detail: e.to_string() }) {
+                    if !unreadable(&e, &mut hand_on) {
                         return Ok(());
                     }
                     continue;
                 }
             };
-            let role = self.roles.get(message.topic).unwrap_or(&Role::None);
-            let topic = self.topic_name(message.topic);
-            let mut go_on = true;
-            translate(&self.rig, role, topic, &message.data, message.log_time_ns, &mut |event| {
-                if let Event::Lost { detail, .. } = &event {
-                    losses[message.topic] += 1;
-                    if losses[message.topic] <= LOGGED_LOSSES_PER_TOPIC {
-                        warn!("{detail}");
-                    }
+            if let Some(Role::Image { camera, .. }) = self.roles.get(message.topic) {
+                let stamp_ns = self.image_stamp_ns(*camera, &message);
+                if !ahead.before_image(stamp_ns, message.log_time_ns, &mut hand_on) {
+                    return Ok(());
                 }
-                go_on = go_on && each(event);
-            });
+            }
+            let mut go_on = true;
+            let mut take = |event| go_on = go_on && hand_on(Some(message.topic), event);
+            match self.roles.get(message.topic) {
+                Some(Role::Image { camera, .. }) if !pixels => take(self.without_pixels(*camera, &message)),
+                _ => self.translate(&message, &mut take),
+            }
+            for e in ahead.errors() {
+                go_on = go_on && unreadable(&e, &mut hand_on);
+            }
             if !go_on {
                 return Ok(());
             }
         }
+        if ahead.rest(&mut hand_on) {
+            for e in ahead.errors() {
+                unreadable(&e, &mut hand_on);
+            }
+        }
         Ok(())
     }
+
+    fn translate(&self, message: &RawMessage, each: &mut dyn FnMut(Event)) {
+        let role = self.roles.get(message.topic).unwrap_or(&Role::None);
+        translate(&self.rig, role, self.topic_name(message.topic), &message.data, message.log_time_ns, each);
+    }
+
+    fn without_pixels(&self, camera: usize, message: &RawMessage) -> Event {
+        let frame = Frame::whole(RgbPicture { width: 0, height: 0, data: Vec::new() });
+        match cdr::header(&message.data) {
+            Ok(header) => {
+                let stamp_ns = if self.rig.stamps_recorded { message.log_time_ns } else { header.stamp_ns };
+                Event::Image { camera, stamp_ns, frame }
+            }
+            Err(e) => {
+                let detail = format!("{} at {} ns: {e}", self.topic_name(message.topic), message.log_time_ns);
+                Event::Lost { camera: Some(camera), reason: DropReason::Decode, detail }
+            }
+        }
+    }
+
+    /// The stamp an image's pose is looked up at.
+    fn image_stamp_ns(&self, camera: usize, message: &RawMessage) -> i64 {
+        let header_ns = cdr::header(&message.data).map_or(message.log_time_ns, |h| h.stamp_ns);
+        let stamp_ns = if self.rig.stamps_recorded { message.log_time_ns } else { header_ns };
+        let offset_sec = self.config.input.image_time_offset_sec.get(camera).copied().unwrap_or(0.0);
+        stamp_ns.saturating_add(signed_ns(offset_sec))
+    }
+}
+
+/// Says and counts a message that could not be read at all.
+fn unreadable(e: &BagError, each: &mut impl FnMut(Option<usize>, Event) -> bool) -> bool {
+    warn!("{e}");
+    each(None, Event::Lost { camera: None, reason: DropReason::Decode, detail: e.to_string() })
 }
 
 /// The topics of `bag` by part; image topics are looked at, since an encoding may say that one shows no colour.

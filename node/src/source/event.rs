@@ -89,3 +89,15 @@ pub enum Event {
         detail: String,
     },
 }
+
+impl Event {
+    /// The same, with another stamp than its header's.
+    pub fn stamped(mut self, ns: i64) -> Self {
+        match &mut self {
+            Self::Image { stamp_ns, .. } | Self::Pose { stamp_ns, .. } | Self::Truth { stamp_ns, .. } => *stamp_ns = ns,
+            Self::Transform(t) => t.header.stamp_ns = ns,
+            Self::StaticTransform(_) | Self::Lost { .. } => {}
+        }
+        self
+    }
+}

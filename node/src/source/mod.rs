@@ -1,6 +1,7 @@
 //! Where images and poses come from. A source turns its own kind of message into [`Event`]s and nothing more; live
 //! topics and recorded bags give the same events, so everything behind them is one program.
 
+mod ahead;
 pub mod bag;
 pub mod cameras;
 pub mod event;
@@ -11,6 +12,7 @@ pub mod masks;
 pub mod mount;
 pub mod rectified;
 pub mod rig;
+pub mod survey;
 pub mod topics;
 pub mod translate;
 pub mod world;

@@ -157,6 +157,8 @@ pub struct Rig {
     pub map_frame: String,
     /// The frame poses are given in, when it is another one that the tree leads to [`Self::map_frame`] from.
     pub pose_frame: Option<String>,
+    /// Messages go by the times of recording (live: of arrival) instead of their headers' stamps.
+    pub stamps_recorded: bool,
 }
 
 impl Rig {
@@ -264,7 +266,8 @@ impl Rig {
             Some(c) if c.mount.origin == MountOrigin::Assumed => first_named([c.frame_id.as_str(), &base_frame]),
             _ => base_frame,
         };
-        Ok(Self { cameras, reference, base_frame, map_frame, pose_frame })
+        let stamps_recorded = config.stamps == "recorded";
+        Ok(Self { cameras, reference, base_frame, map_frame, pose_frame, stamps_recorded })
     }
 
     /// Says once for each camera what was decided, and what is doubtful. `size` is width and height of the network's pictures.

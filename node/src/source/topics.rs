@@ -140,6 +140,14 @@ pub struct TopicPlan {
 }
 
 impl TopicPlan {
+    /// The topics the vehicle's pose comes from.
+    pub fn pose_topics(&self) -> Vec<usize> {
+        match self.pose {
+            PoseTopic::Message(topic) => vec![topic],
+            PoseTopic::Tf => self.tf.clone(),
+        }
+    }
+
     /// Matches `topics` to their parts; `first` tells encodings where the messages can be looked at.
     ///
     /// # Errors

@@ -6,6 +6,7 @@ use anyhow::Result;
 
 use crate::cdr::decode as cdr;
 use crate::decode;
+use crate::error_line::error_line;
 use crate::pipeline::guard::caught;
 use crate::sync::DropReason;
 
@@ -49,8 +50,12 @@ pub enum Role {
 /// decoder that panics loses this one message: it keeps nothing from one to the next.
 pub fn translate(rig: &Rig, role: &Role, topic: &str, data: &[u8], logged_ns: i64, each: &mut dyn FnMut(Event)) {
     let (reason, why) = match caught(|| events(rig, role, data)) {
-        Ok(Ok(events)) => return events.into_iter().for_each(each),
-        Ok(Err(e)) => (DropReason::Decode, format!("{e:#}")),
+        Ok(Ok(events)) => {
+            return events.into_iter().for_each(|event| {
+                each(if rig.stamps_recorded { event.stamped(logged_ns) } else { event });
+            });
+        }
+        Ok(Err(e)) => (DropReason::Decode, error_line(&e)),
         Err(what) => (DropReason::Panic, format!("its decoder panicked ({what}); this is a fault of the program")),
     };
     // The header stamp when it can be read, else the log time.

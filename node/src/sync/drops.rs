@@ -11,10 +11,14 @@ use serde::Serialize;
 pub enum DropReason {
     /// Older than a set that was already emitted.
     Late,
-    /// A second image of one camera with the same stamp.
+    /// A second image of one camera with the same stamp. Not a loss.
     Duplicate,
-    /// Its set never became complete: a camera's image is missing, or this camera sends more often than the others.
+    /// Its set never became complete: another camera's image is missing.
     Incomplete,
+    /// Its camera sends more often than the slowest one, and no set could take it. Not a loss.
+    Surplus,
+    /// At the start or end of the recording, where the poses or the other cameras have not begun or have ended. Not a loss.
+    Edge,
     /// No pose for its stamp: older than the first pose, or none came within the bounded wait.
     NoPose,
     /// The poses around its stamp lie too far apart to be interpolated.
@@ -34,10 +38,12 @@ pub enum DropReason {
 
 impl DropReason {
     /// Every reason, in order.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::Late,
         Self::Duplicate,
         Self::Incomplete,
+        Self::Surplus,
+        Self::Edge,
         Self::NoPose,
         Self::PoseGap,
         Self::NoCalibration,
@@ -47,12 +53,19 @@ impl DropReason {
         Self::Panic,
     ];
 
+    /// False for images that nothing could have been made of in any case.
+    pub fn is_loss(self) -> bool {
+        !matches!(self, Self::Duplicate | Self::Surplus | Self::Edge)
+    }
+
     /// The name used in logs and `metrics.json`.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Late => "late",
             Self::Duplicate => "duplicate",
             Self::Incomplete => "incomplete",
+            Self::Surplus => "surplus",
+            Self::Edge => "edge",
             Self::NoPose => "no_pose",
             Self::PoseGap => "pose_gap",
             Self::NoCalibration => "no_calibration",
@@ -81,6 +94,21 @@ impl DropCounts {
         if n > 0 {
             *self.0.entry(reason).or_insert(0) += n;
         }
+    }
+
+    /// Counts `n` images for another reason than before, as far as there are so many.
+    pub fn recount(&mut self, from: DropReason, to: DropReason, n: u64) {
+        let moved = n.min(self.get(from));
+        if let Some(count) = self.0.get_mut(&from) {
+            *count -= moved;
+        }
+        self.0.retain(|_, count| *count > 0);
+        self.add(to, moved);
+    }
+
+    /// Images that were lost: all but those counted for a reason that is no loss.
+    pub fn lost(&self) -> u64 {
+        self.iter().filter(|(reason, _)| reason.is_loss()).map(|(_, n)| n).sum()
     }
 
     /// Images dropped for this reason.

@@ -1,5 +1,6 @@
 //! Images of several cameras brought together around a reference stamp.
 
+mod cadence;
 pub(crate) mod clock;
 mod drops;
 mod starvation;
@@ -10,6 +11,7 @@ pub use drops::{DropCounts, DropReason};
 pub use starvation::{StarvationReport, TopicReport};
 
 use crate::config::SyncConfig;
+use cadence::Cadence;
 use clock::{ClockGuard, signed_ns, unsigned_ns};
 use starvation::StarvationWatch;
 
@@ -58,6 +60,7 @@ pub struct Synchronizer<T> {
     drops: DropCounts,
     images_in: u64,
     watch: StarvationWatch,
+    cadence: Cadence,
 }
 
 impl<T> Synchronizer<T> {
@@ -78,6 +81,7 @@ impl<T> Synchronizer<T> {
             drops: DropCounts::default(),
             images_in: 0,
             watch: StarvationWatch::new(cameras, config.starvation_sec, config.slop_sec),
+            cadence: Cadence::new(cameras),
         }
     }
 
@@ -123,10 +127,12 @@ impl<T> Synchronizer<T> {
         let before_ns = self.now_ns.filter(|&before_ns| self.clock.near(newest_ns, before_ns));
         let now_ns = before_ns.map_or(now_ns, |before_ns| before_ns.max(now_ns));
         self.now_ns = Some(now_ns);
-        for waiting in &mut self.waiting {
+        for (camera, waiting) in self.waiting.iter_mut().enumerate() {
             let before = waiting.len();
             waiting.retain(|_, w| w.since_ns.saturating_add(self.timeout_ns) >= now_ns);
-            self.drops.add(DropReason::Incomplete, (before - waiting.len()) as u64);
+            let left = before - waiting.len();
+            self.drops.add(DropReason::Incomplete, left as u64);
+            self.cadence.left(camera, left);
         }
     }
 
@@ -137,7 +143,15 @@ impl<T> Synchronizer<T> {
 
     /// End of the recording: nothing more will come, so what waits is dropped. Complete sets stay to be popped.
     pub fn flush(&mut self) {
-        self.drop_waiting(DropReason::Incomplete);
+        for camera in 0..self.waiting.len() {
+            for (stamp_ns, _) in std::mem::take(&mut self.waiting[camera]) {
+                let reason = match self.reference_ns {
+                    Some(last_ns) => self.cadence.at_edge(camera, stamp_ns.abs_diff(last_ns), self.edge_ns()),
+                    None => DropReason::Incomplete,
+                };
+                self.drops.add(reason, 1);
+            }
+        }
         if self.clock.reset().is_some() {
             self.drops.add(DropReason::ClockJump, 1);
         }
@@ -149,6 +163,12 @@ impl<T> Synchronizer<T> {
             self.drops.add(DropReason::ClockJump, 1);
         }
         self.start_anew();
+    }
+
+    /// So long before the first set and after the last one, an image without a partner only says that the cameras did not begin
+    /// or end together.
+    fn edge_ns(&self) -> u64 {
+        self.timeout_ns.unsigned_abs()
     }
 
     /// Dropped images by reason.
@@ -177,8 +197,19 @@ impl<T> Synchronizer<T> {
         self.watch.report(now_ns)
     }
 
+    /// An image of a camera could not be read: it counts in the starvation report.
+    pub fn unreadable(&mut self, camera: usize) {
+        self.watch.unreadable(camera);
+    }
+
+    /// In one sentence why images found no partner, with the key that may change it; `names`: the image topics.
+    pub fn why_incomplete(&self, names: &[String]) -> String {
+        self.watch.why_incomplete(names)
+    }
+
     fn start_anew(&mut self) {
         self.drop_waiting(DropReason::ClockJump);
+        self.cadence.reset();
         self.used_ns.fill(None);
         self.reference_ns = None;
         self.now_ns = None;
@@ -202,6 +233,7 @@ impl<T> Synchronizer<T> {
             self.drops.add(DropReason::Late, 1);
             return;
         }
+        self.cadence.image(camera, stamp_ns);
         let now_ns = self.now_ns.filter(|&now_ns| self.clock.near(stamp_ns, now_ns));
         let since_ns = now_ns.map_or(stamp_ns, |now_ns| now_ns.max(stamp_ns));
         self.waiting[camera].insert(stamp_ns, Waiting { since_ns, item });
@@ -249,7 +281,7 @@ impl<T> Synchronizer<T> {
     }
 
     fn emit(&mut self, reference_ns: i64, picks_ns: &[i64]) {
-        self.reference_ns = Some(reference_ns);
+        let last_ns = self.reference_ns.replace(reference_ns);
         let mut frames = Vec::with_capacity(picks_ns.len());
         for (camera, &pick_ns) in picks_ns.iter().enumerate() {
             if let Some(waiting) = self.waiting[camera].remove(&pick_ns) {
@@ -260,10 +292,21 @@ impl<T> Synchronizer<T> {
         for camera in 0..self.waiting.len() {
             if let Some(after_ns) = self.floor_ns(camera).and_then(|floor_ns| floor_ns.checked_add(1)) {
                 let kept = self.waiting[camera].split_off(&after_ns);
-                self.drops.add(DropReason::Incomplete, self.waiting[camera].len() as u64);
-                self.waiting[camera] = kept;
+                let left = std::mem::replace(&mut self.waiting[camera], kept);
+                if last_ns.is_none() {
+                    for &stamp_ns in left.keys() {
+                        let before_ns = reference_ns.abs_diff(stamp_ns);
+                        self.drops.add(self.cadence.at_edge(camera, before_ns, self.edge_ns()), 1);
+                    }
+                } else {
+                    self.drops.add(DropReason::Incomplete, left.len() as u64);
+                    self.cadence.left(camera, left.len());
+                }
             }
         }
+        // Before the first set nobody knows whether an image was surplus.
+        let surplus = self.cadence.set(last_ns.map_or(u64::MAX, |ns| reference_ns.abs_diff(ns)));
+        self.drops.recount(DropReason::Incomplete, DropReason::Surplus, surplus);
         self.watch.set_emitted();
         self.ready.push_back(FrameSet { stamp_ns: reference_ns, epoch: self.epoch, frames });
     }

@@ -14,6 +14,8 @@ const REMEMBERED_STAMPS: usize = 64;
 pub struct TopicReport {
     /// Images since the last set (or the start).
     pub images: u64,
+    /// Images since then that could not be read.
+    pub unreadable: u64,
     /// Newest stamp ever seen, offsets applied.
     pub newest_stamp_ns: Option<i64>,
 }
@@ -39,6 +41,9 @@ impl StarvationReport {
         for (i, t) in self.topics.iter().enumerate() {
             let name = topics.get(i).map_or_else(|| format!("camera {i}"), Clone::clone);
             out += &format!(" {name} {} images", t.images);
+            if t.unreadable > 0 {
+                out += &format!(" and {} that cannot be read", t.unreadable);
+            }
             if let Some(stamp_ns) = t.newest_stamp_ns {
                 out += &format!(
                     " (newest stamp {}.{:09})",
@@ -51,8 +56,10 @@ impl StarvationReport {
         if let Some(gap_sec) = self.nearest_gap_sec {
             out += &format!(" nearest stamp gap {gap_sec:.3} s against sync.slop_sec {:.3}.", self.slop_sec);
         }
-        out += if self.topics.iter().any(|t| t.images == 0) {
-            " A camera sends nothing: check its topic and QoS."
+        out += if self.topics.iter().any(|t| t.images == 0 && t.unreadable > 0) {
+            " A camera's images cannot be read; the warnings about them say why."
+        } else if self.topics.iter().any(|t| t.images == 0) {
+            " A camera sends nothing: check its topic, and live its QoS."
         } else if self.nearest_gap_sec.is_some_and(|gap_sec| gap_sec > self.slop_sec) {
             " Raise sync.slop_sec, or set input.image_time_offset_sec."
         } else {
@@ -76,6 +83,9 @@ pub(crate) struct StarvationWatch {
 #[derive(Debug, Default)]
 struct Seen {
     images: u64,
+    unreadable: u64,
+    /// Images in all.
+    total: u64,
     newest_ns: Option<i64>,
     recent_ns: VecDeque<i64>,
 }
@@ -89,6 +99,7 @@ impl StarvationWatch {
     pub fn image(&mut self, camera: usize, stamp_ns: i64) {
         if let Some(seen) = self.cameras.get_mut(camera) {
             seen.images += 1;
+            seen.total += 1;
             seen.newest_ns = Some(seen.newest_ns.map_or(stamp_ns, |n| n.max(stamp_ns)));
             seen.recent_ns.push_back(stamp_ns);
             if seen.recent_ns.len() > REMEMBERED_STAMPS {
@@ -97,10 +108,16 @@ impl StarvationWatch {
         }
     }
 
+    pub fn unreadable(&mut self, camera: usize) {
+        if let Some(seen) = self.cameras.get_mut(camera) {
+            seen.unreadable += 1;
+        }
+    }
+
     pub fn set_emitted(&mut self) {
         self.sets += 1;
         for seen in &mut self.cameras {
-            seen.images = 0;
+            (seen.images, seen.unreadable) = (0, 0);
             seen.recent_ns.clear();
         }
     }
@@ -117,9 +134,30 @@ impl StarvationWatch {
             return None;
         }
         self.quiet_since = Some((now_ns, self.sets));
-        let topics =
-            self.cameras.iter().map(|s| TopicReport { images: s.images, newest_stamp_ns: s.newest_ns }).collect();
+        let topic = |s: &Seen| TopicReport { images: s.images, unreadable: s.unreadable, newest_stamp_ns: s.newest_ns };
+        let topics = self.cameras.iter().map(topic).collect();
         Some(StarvationReport { quiet_sec, topics, nearest_gap_sec: self.nearest_gap_sec(), slop_sec: self.slop_sec })
+    }
+
+    /// In one sentence why images found no partner, with the key that may change it.
+    pub fn why_incomplete(&self, names: &[String]) -> String {
+        let name = |i: usize| names.get(i).map_or_else(|| format!("camera {i}"), Clone::clone);
+        let count = |(i, s): (usize, &Seen)| format!("{} {}", name(i), s.total);
+        let counts: Vec<String> = self.cameras.iter().enumerate().map(count).collect();
+        let (least, most) = (self.cameras.iter().map(|s| s.total).min(), self.cameras.iter().map(|s| s.total).max());
+        let advice = match self.nearest_gap_sec() {
+            Some(gap_sec) if gap_sec > self.slop_sec => {
+                let slop_sec = self.slop_sec;
+                format!(
+                    "the nearest stamps lie {gap_sec:.3} s apart, sync.slop_sec is {slop_sec}: raise it, or set input.image_time_offset_sec"
+                )
+            }
+            _ if least.zip(most).is_some_and(|(least, most)| least.saturating_mul(2) < most) => {
+                "a set takes one image of each camera: leave the rare camera out with input.images".into()
+            }
+            _ => "they come too late for each other: raise sync.timeout_sec".into(),
+        };
+        format!("images of the cameras ({}) do not come together; {advice}", counts.join(", "))
     }
 
     fn nearest_gap_sec(&self) -> Option<f64> {

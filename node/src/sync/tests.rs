@@ -44,7 +44,8 @@ fn the_nearest_of_several_images_is_taken() {
     s.push(1, SEC + 98 * MS, 1);
     let set = s.pop().unwrap();
     assert_eq!(set.frames[0], (SEC + 100 * MS, 100));
-    assert_eq!((s.pending(), s.drops().get(DropReason::Incomplete)), (0, 3));
+    // Older than the first set, so that nobody can say whether a partner is missing.
+    assert_eq!((s.pending(), s.drops().get(DropReason::Edge)), (0, 3));
 }
 
 #[test]
@@ -58,7 +59,40 @@ fn a_camera_at_twice_the_rate_gives_every_set_and_counts_the_rest() {
         s.advance(SEC + i * 50 * MS);
     }
     s.flush();
-    assert_eq!((drain(&mut s).len(), s.drops().get(DropReason::Incomplete), s.drops().total()), (50, 50, 50));
+    assert_eq!((drain(&mut s).len(), s.drops().get(DropReason::Surplus), s.drops().total()), (50, 50, 50));
+    assert_eq!(s.drops().lost(), 0);
+}
+
+#[test]
+fn an_image_missing_from_the_slower_camera_is_a_loss_and_the_faster_cameras_others_are_not() {
+    let mut s = sync(2);
+    for i in 0..100 {
+        s.push(0, SEC + i * 50 * MS, 0);
+        // Every tenth image of the slower camera is missing.
+        if i % 2 == 0 && i % 20 != 10 {
+            s.push(1, SEC + i * 50 * MS + 3 * MS, 1);
+        }
+        s.advance(SEC + i * 50 * MS);
+    }
+    s.flush();
+    let d = s.drops();
+    assert_eq!((d.get(DropReason::Incomplete), d.get(DropReason::Surplus), d.total()), (5, 50, 55));
+}
+
+#[test]
+fn cameras_that_begin_and_end_apart_lose_nothing() {
+    let mut s = sync(2);
+    for i in 0..30 {
+        if i < 28 {
+            s.push(0, SEC + i * 100 * MS, 0);
+        }
+        if i >= 2 {
+            s.push(1, SEC + i * 100 * MS, 1);
+        }
+        s.advance(SEC + i * 100 * MS);
+    }
+    s.flush();
+    assert_eq!((drain(&mut s).len(), s.drops().get(DropReason::Edge), s.drops().lost()), (26, 4, 0));
 }
 
 #[test]

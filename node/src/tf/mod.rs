@@ -8,7 +8,7 @@ pub use error::{TfError, TfProblem};
 
 use crate::config::SyncConfig;
 use crate::msg::TransformStamped;
-use crate::poses::{PoseLookup, PoseMissing, PoseNote, Timeline, checked};
+use crate::poses::{PoseLookup, PoseMissing, PoseNote, PoseTiming, Timeline, checked};
 use crate::rigid::Rigid;
 use crate::sync::clock::seconds_between;
 use crate::window::relative;
@@ -186,6 +186,24 @@ impl TfTree {
     pub fn root(&self, frame: &str) -> Option<&str> {
         let index = self.by_name.get(bare(frame)).copied()?;
         self.ancestors(index).last().map(|&top| self.frames[top].name.as_str())
+    }
+
+    /// How the moving transforms between two frames come: the stamp up to which all of them are known, and how often the
+    /// slowest comes.
+    pub fn timing(&self, target: &str, source: &str) -> PoseTiming {
+        let index = |name: &str| self.by_name.get(bare(name)).copied();
+        let (Some(target), Some(source)) = (index(target), index(source)) else { return PoseTiming::default() };
+        let (above_target, above_source) = (self.ancestors(target), self.ancestors(source));
+        let one_way = |f: &&usize| above_target.contains(f) != above_source.contains(f);
+        let mut timing = PoseTiming::default();
+        for &frame in above_target.iter().chain(&above_source).filter(one_way) {
+            let Some(Edge { motion: Motion::Moving(timeline), .. }) = &self.frames[frame].edge else { continue };
+            let Some(latest_ns) = timeline.latest_ns() else { continue };
+            timing.latest_ns = Some(timing.latest_ns.map_or(latest_ns, |ns| ns.min(latest_ns)));
+            let interval_sec = timeline.usual_interval_sec().unwrap_or(0.0);
+            timing.interval_sec = Some(timing.interval_sec.map_or(interval_sec, |sec| sec.max(interval_sec)));
+        }
+        timing
     }
 
     /// True when both names were heard of.

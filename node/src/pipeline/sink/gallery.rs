@@ -106,14 +106,18 @@ impl Gallery {
         };
         let report = Report {
             title: format!("storm: {}", run.title),
-            subtitle: format!("{}; {:.1} s recorded", metrics.model, metrics.recorded_sec),
+            subtitle: match &metrics.no_steps {
+                Some(why) => format!("{}; {why}", metrics.model),
+                None => format!("{}; {:.1} s recorded", metrics.model, metrics.recorded_sec),
+            },
             weights,
             highlights: highlights(metrics),
             summary: summary(metrics, rig),
             drops: metrics.dropped.iter().map(|(reason, n)| (reason.clone(), *n)).collect(),
             errors: metrics.held_out.as_ref().map(|s| error_table(&s.rows())),
             steps,
-            top_view: Some(top_view(run)),
+            // Without a map it would be a black square.
+            top_view: (!run.map.is_empty()).then(|| top_view(run)),
             timings: metrics
                 .latency_ms
                 .iter()

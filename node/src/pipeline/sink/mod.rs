@@ -15,9 +15,10 @@ use std::time::Duration;
 use anyhow::{Context, Result};
 use tracing::warn;
 
-use crate::config::Config;
+use crate::config::{Config, WindowConfig};
 use crate::engine::Engine;
 use crate::engine::score::Scorer;
+use crate::error_line::error_line;
 use crate::objects::MovingObject;
 use crate::output::OutputError;
 use crate::output::objects_csv::ObjectsWriter;
@@ -34,6 +35,7 @@ use super::front::TruthImage;
 use super::map_updates::MapUpdate;
 use super::messages::Published;
 use super::metrics::{Counts, Metrics};
+use super::posed::seconds;
 use super::step::{Finished, Step};
 use super::timing::{Timings, peak_rss_mb};
 use crate::output::atomic::write_bytes;
@@ -271,7 +273,11 @@ impl Sink {
             None => None,
         };
         problems.extend(counts.problems);
+        let recorded_sec = trajectory.recorded_ns() as f64 * 1e-9;
+        let tried = finished.steps + counts.non_finite_windows;
+        let no_steps = (tried == 0).then(|| no_steps(&config.window, self.sets, recorded_sec));
         let mut metrics = Metrics {
+            recording: self.title.clone(),
             weights,
             model,
             images_in: counts.images_in,
@@ -291,7 +297,7 @@ impl Sink {
             latency_ms: timings.stats(),
             peak_rss_mb: peak_rss_mb(),
             wall_sec: wall.as_secs_f64(),
-            recorded_sec: trajectory.recorded_ns() as f64 * 1e-9,
+            recorded_sec,
             gaussians: self.last_gaussians,
             gaussians_left_out: published.truncated,
             map_gaussians: finished.map.len() as u64,
@@ -308,6 +314,8 @@ impl Sink {
             base_frame: rig.base_frame.clone(),
             origin_m: origin.to_array(),
             epochs: self.epochs,
+            verdict: counts.verdict,
+            no_steps,
             held_out,
         };
         let json = serde_json::to_string_pretty(&metrics).context("metrics.json")? + "\n";
@@ -318,15 +326,27 @@ impl Sink {
         let title = self.title;
         let run = Run { title: &title, metrics: &metrics, map: &map, tracks: &rows, poses: &poses, config: &config };
         if let Err(e) = gallery.write(&place("report.html"), &rig, &run) {
-            late.push(format!("report.html could not be written: {e:#}"));
+            late.push(format!("report.html could not be written: {}", error_line(&e)));
         }
         metrics.problems.extend(late);
         Ok(metrics)
     }
 }
 
+/// Why there was no window, and what one needs.
+fn no_steps(window: &WindowConfig, sets: u64, recorded_sec: f64) -> String {
+    format!(
+        "no step was run: a window needs {} timesteps {} s apart, {} s in all (window.timesteps, window.stride_sec), and there are \
+         {sets} sets of images with poses over {} s",
+        window.timesteps,
+        window.stride_sec,
+        seconds(window.span_sec()),
+        seconds(recorded_sec)
+    )
+}
+
 fn gave_up(problems: &mut Vec<String>, what: &str, e: &anyhow::Error) {
-    let line = format!("{what} could not be written: {e:#}");
+    let line = format!("{what} could not be written: {}", error_line(e));
     warn!("{line}");
     problems.push(line);
 }
