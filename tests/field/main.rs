@@ -11,6 +11,7 @@ mod frames;
 mod not_color;
 mod recording;
 mod run;
+mod time;
 
 use recording::Recording;
 use run::control;
