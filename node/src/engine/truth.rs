@@ -1,5 +1,6 @@
 //! What is true of one picture, at the picture's size.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use anyhow::Result;
@@ -67,6 +68,14 @@ impl TruthAt {
         self.valid.as_ref().is_none_or(|valid| valid.get(i).copied().unwrap_or(true))
     }
 
+    /// A picture with the camera's own colours where it saw nothing, and the share of the pixels it saw, 0 to 1.
+    pub fn or_true<'a>(&self, pred01: &'a [f32], true01: &[f32]) -> (Cow<'a, [f32]>, f64) {
+        let Some(valid) = &self.valid else { return (pred01.into(), 1.0) };
+        let pixels = pred01.iter().zip(true01).enumerate();
+        let shown = pixels.map(|(i, (pred, truth))| if self.is_valid(i / 3) { *pred } else { *truth }).collect();
+        (Cow::Owned(shown), valid.iter().filter(|valid| **valid).count() as f64 / valid.len().max(1) as f64)
+    }
+
     /// Takes one kind from a recorded image, sampled at pixel centres; an image whose length does not fit its size is none.
     pub fn set(&mut self, kind: TruthKind, image: &TruthImage) {
         let size = self.size;
@@ -116,6 +125,25 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
+
+    #[test]
+    fn pixels_nobody_saw_are_compared_in_no_figure() {
+        let valid: Arc<[bool]> = (0..200).map(|i| i >= 60).collect();
+        let mut truth = TruthAt::none((20, 10));
+        (truth.depth, truth.moving) = (Some(vec![4.0; 200]), Some(vec![1; 200]));
+        let truth = truth.seen(Some(&valid));
+        assert_eq!(truth.depth.as_ref().unwrap().iter().filter(|d| **d > 0.0).count(), 140);
+        assert_eq!(truth.moving.as_ref().unwrap().iter().filter(|m| **m > 0).count(), 140);
+        let true01: Vec<f32> = (0..600).map(|i| (i % 7) as f32 / 7.0).collect();
+        let drawn = |unseen: f32| -> Vec<f32> {
+            true01.iter().enumerate().map(|(i, t)| if i < 180 { unseen } else { t * 0.8 }).collect()
+        };
+        let score = |unseen: f32| truth.compare(&drawn(unseen), &true01, Some(&[5.0; 200])).unwrap();
+        assert_eq!(score(0.0), score(1.0));
+        assert_eq!(score(0.0).depth_rmse, Some(1.0));
+        let (known, share) = truth.or_true(&[0.5; 600], &true01);
+        assert_eq!((share, known[0], known[599]), (0.7, true01[0], 0.5));
+    }
 
     #[test]
     fn truth_is_sampled_at_pixel_centres() {

@@ -209,7 +209,11 @@ impl Tally {
         let known = truth.sky.as_ref().map(|sky| sky.iter().map(|&s| s != 0).collect());
         let sky: Option<Vec<bool>> =
             known.or_else(|| view.map(|view| view.alpha.iter().map(|&a| a < SURFACE_OPACITY).collect()));
-        self.breakdown.mends(Mends::of(&image(pred), &image(true01), sky.as_deref())?);
+        let (known, share) = truth.or_true(pred, true01);
+        let mends = Mends::of(&image(&known), &image(true01), sky.as_deref())?;
+        // Pixels without an error leave every gain what it is, but not the mean error.
+        let of_seen = |m: Mends| Mends { psnr: m.psnr.map(|db| db + 10.0 * share.log10()), ..m };
+        self.breakdown.mends(if share < 1.0 { mends.map(of_seen) } else { mends });
         for (i, &z) in truth.depth.iter().flatten().enumerate().filter(|(_, z)| **z > 0.0) {
             let channels = 3 * i..3 * i + 3;
             if let (Some(p), Some(t)) = (pred.get(channels.clone()), true01.get(channels)) {
