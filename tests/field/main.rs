@@ -12,6 +12,7 @@ mod not_color;
 mod recording;
 mod run;
 mod time;
+mod unseen;
 
 use recording::Recording;
 use run::control;
