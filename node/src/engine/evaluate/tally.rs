@@ -121,7 +121,7 @@ impl Tally {
         let mut raster = CpuRasterizer::new(first.scene.raster_settings())?;
         let mut flows = Vec::new();
         let mut clouds = Vec::new();
-        for frame in &clip.frames {
+        for frame in clip.frames.iter().filter(|f| f.context.is_some() || f.held_out()) {
             let nearest = scenes.iter().min_by_key(|s| s.stamp_ns.abs_diff(frame.set.stamp_ns));
             let Some(placed) = nearest else { continue };
             let views = draw(placed, clip, frame, &mut raster)?;

@@ -71,6 +71,19 @@ fn ceilings_lie_above_what_knows_no_motion() {
 }
 
 #[test]
+fn no_method_is_scored_on_images_that_the_network_saw_as_prior_ones() {
+    let clip = Clip::of_seed(SEED, SIZE, 0.1).unwrap();
+    let held_out = clip.frames.iter().filter(|f| f.held_out()).count();
+    // One before each of the four timesteps but the first, which the drive begins with.
+    assert_eq!(held_out, CLIP_FRAMES - 4 - 3);
+    for method in [Method::Storm, Method::NearestContext] {
+        let mut evaluation = Evaluation::new(engine(3), None, &[method], Effort::default());
+        evaluation.add(&clip, &mut |_, _| {}).unwrap();
+        assert_eq!(evaluation.images(), 3 * held_out, "{}", method.name());
+    }
+}
+
+#[test]
 fn a_frame_that_equals_its_context_is_answered_perfectly_by_it() {
     let mut clip = Clip::of_seed(SEED, SIZE, 0.0).unwrap();
     // Frame 1 becomes a copy of frame 0 but for one grey level in one value.
