@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3};
 use storm_render::Intrinsics;
 
 use super::*;
-use crate::msg::{CameraInfo, Header};
+use crate::msg::{CameraInfo, Header, TransformStamped};
 use crate::source::mount::PoseNames;
 use crate::source::rig::CameraDescription;
 
@@ -54,10 +54,11 @@ fn a_joint_is_looked_up_at_the_pictures_stamp_and_the_map_frame_at_the_poses() {
     let mut stage = PoseStage::new(PoseStore::of_messages(&rig, &config, statics), &rig, &config.sync);
     for i in 0..3i64 {
         let (stamp_ns, at) = (i * 100 * MS, i as f64);
-        stage.push_pose(stamp_ns, Rigid::new(DQuat::IDENTITY, DVec3::new(0.0, at, 0.0)));
+        stage
+            .take_pose(&Event::Pose { stamp_ns, map_from_base: Rigid::new(DQuat::IDENTITY, DVec3::new(0.0, at, 0.0)) });
         // The head turns by a tenth of a radian a sample, the map is put right by a metre a sample.
-        stage.push_transform(&transform("base", "head", stamp_ns, 0.1 * at, 1.0), false);
-        stage.push_transform(&transform("map", "odom", stamp_ns, 0.0, 100.0 + at), false);
+        stage.take_pose(&Event::Transform(Box::new(transform("base", "head", stamp_ns, 0.1 * at, 1.0))));
+        stage.take_pose(&Event::Transform(Box::new(transform("map", "odom", stamp_ns, 0.0, 100.0 + at))));
     }
     stage.push_set(set(150 * MS));
     let posed = stage.pop(200 * MS).unwrap();
@@ -69,11 +70,11 @@ fn a_joint_is_looked_up_at_the_pictures_stamp_and_the_map_frame_at_the_poses() {
     let base = stage.base_pose(0, 150 * MS, &map_from_camera);
     assert!((base.translation - DVec3::new(101.5, 1.5, 0.0)).length() < 1e-9, "{:?}", base.translation);
     // The pose is there, the joint is not yet: the picture waits.
-    stage.push_pose(300 * MS, Rigid::IDENTITY);
-    stage.push_transform(&transform("map", "odom", 300 * MS, 0.0, 103.0), false);
+    stage.take_pose(&Event::Pose { stamp_ns: 300 * MS, map_from_base: Rigid::IDENTITY });
+    stage.take_pose(&Event::Transform(Box::new(transform("map", "odom", 300 * MS, 0.0, 103.0))));
     stage.push_set(set(250 * MS));
     assert!(stage.pop(300 * MS).is_none());
-    stage.push_transform(&transform("base", "head", 300 * MS, 0.3, 1.0), false);
+    stage.take_pose(&Event::Transform(Box::new(transform("base", "head", 300 * MS, 0.3, 1.0))));
     assert!(stage.pop(300 * MS).is_some());
 }
 
