@@ -81,8 +81,9 @@ fn without_any_of_it_nothing_is_masked() {
 #[test]
 fn calibration_that_cuts_nothing_off() {
     let ran = replay(Recording::control().infos(INFO, wide(0.85)), &[]);
-    // The world is smaller in the image: less detail is lost, and more of it moves less.
-    ran.like_control(1.0).says(&["camera 0", "of the pixels show nothing"]);
+    // The world is smaller and smoother in the image, so that it may score better than the control; black that counted costs 15 dB.
+    assert!(ran.psnr() > control().psnr() - 1.0, "{} dB for {}", ran.psnr(), control().psnr());
+    ran.says(&["camera 0", "of the pixels show nothing"]);
     let share = masked_share(&ran);
     assert!((share - (1.0 - 0.85 * 0.85)).abs() < 0.03, "{share}");
 }
