@@ -95,7 +95,7 @@ pub(super) struct Breakdown {
     mends: MendMeans,
 }
 
-/// The figures of [`Breakdown`].
+/// The figures of `Breakdown`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct BreakdownFigures {
     /// Movers (road users at 0.5 m/s or faster), all together.
